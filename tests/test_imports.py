@@ -194,7 +194,7 @@ PURE = {
     "statistics", "typing",
     "v2v_protocol", "v2v_protocol.arena", "v2v_protocol.errors", "v2v_protocol.liveness", "v2v_protocol.messages",
     "v2v_protocol.recipe", "v2v_protocol.sample", "v2v_protocol.spec",
-    "v2v_server.corpus.videos", "v2v_server.schedule", "v2v_server.sharing", "v2v_server.system.log",
+    "v2v_server.corpus.videos", "v2v_server.lease_memory", "v2v_server.schedule", "v2v_server.sharing", "v2v_server.system.log",
 }  # fmt: skip
 """What the broker may import: nothing here reads a file, but for the quarantine, of which it uses the values."""
 

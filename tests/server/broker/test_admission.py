@@ -15,7 +15,7 @@ from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import CorpusError, UsageError
 from v2v_protocol.messages import Hello
 from v2v_protocol.spec import StreamSpec
-from v2v_server import schedule as sequences
+from v2v_server import corpus_words, lease_memory
 from v2v_server.broker.admission import admit
 from v2v_server.broker.state import Broker
 from v2v_server.corpus.catalogue import Catalogue
@@ -96,7 +96,8 @@ def test_the_quarantine_is_the_newest_unless_an_older_one_is_asked_for() -> None
 def test_how_many_share_a_decode_decides_what_a_worker_can_hold(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two such specs shared a table: how many sequences there were depended on who had come first."""
     at = admission()
-    monkeypatch.setattr(sequences, "MOST_CLIP_BYTES", 400)  # one sample takes 320
+    for limited in (corpus_words, lease_memory):  # one sample takes 320
+        monkeypatch.setattr(limited, "MOST_CLIP_BYTES", 400)
     admit(at, b"c", hello(), 0.0)
     with pytest.raises(UsageError, match="MiB of decoded frames"):
         admit(at, b"d", hello(samples_per_decode=2), 0.0)
