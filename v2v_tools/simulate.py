@@ -106,7 +106,7 @@ def _run(asked: argparse.Namespace) -> None:
             camera = Camera.of(sample.arrays, provenance, f"index {asked.index}", spec.recipe)
             write_png(asked.picture, draw_sheet([camera], f"seed {asked.seed}, epoch {asked.epoch}", moments=_MOMENTS))
         if asked.events is not None:
-            events = list_sample_events(remade.lease, remade.decoded)
+            events = list_sample_events(remade.job.clip, remade.decoded)
             write_events(asked.events, events)
             show(f"{len(events)} events written to {asked.events}")
     except OSError as error:

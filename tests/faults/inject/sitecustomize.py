@@ -62,9 +62,9 @@ def _install(fault: dict) -> None:
     # A confined worker may write to no folder but its cache.
     worker.confine = lambda written, **more: confine(written and [*written, folder], **more)
 
-    def decoding(lease, *rest):
-        at["video"] = lease.video
-        return decode_for(lease, *rest)
+    def decoding(clip, *rest):
+        at["video"] = clip.video
+        return decode_for(clip, *rest)
 
     def before(stage, function):
         def call(*arguments, **named):
