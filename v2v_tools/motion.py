@@ -28,7 +28,9 @@ from v2v_server.video.decode import ClipRequest, Cut, DecodedClip
 from v2v_server.video.picture import SDR
 from v2v_server.video.rows import Rows
 from v2v_server.worker.job import ClipJob, SampleJob
-from v2v_server.worker.produce import Decoded, make_sample, plan_sample
+from v2v_server.worker.making.make import make_sample
+from v2v_server.worker.making.plan import plan_sample
+from v2v_server.worker.making.read import Decoded
 from v2v_tools.remake import RemadeSample, Remaker, lease_for
 
 LONGEST_SIDE_PX = 384

@@ -21,7 +21,8 @@ from v2v_server.store.pixels import VideosKind
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
 from v2v_server.worker.job import SampleJob
-from v2v_server.worker.produce import Decoded, decode_for, list_sample_events, make_sample, open_sidecars
+from v2v_server.worker.making.make import list_sample_events, make_sample
+from v2v_server.worker.making.read import Decoded, decode_for, open_sidecars
 
 
 @dataclass(frozen=True, slots=True)

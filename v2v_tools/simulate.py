@@ -23,7 +23,7 @@ from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.config import ServeConfig
 from v2v_server.quarantine import Quarantine, quarantine_path, read_quarantine
 from v2v_server.store.pixels import VideosKind
-from v2v_server.worker.produce import list_sample_events
+from v2v_server.worker.making.make import list_sample_events
 from v2v_tools.event_files import EVENT_WRITERS, check_event_file, write_events
 from v2v_tools.remake import Remaker, open_shown
 

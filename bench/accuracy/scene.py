@@ -35,7 +35,7 @@ from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.flow import flow_for, one_thread
 from v2v_server.schedule import SequenceTable
 from v2v_server.worker.job import ClipJob
-from v2v_server.worker.produce import Decoded, decode_for
+from v2v_server.worker.making.read import Decoded, decode_for
 from v2v_server.worker.scene_choice import TOLERANCE_PX
 from v2v_tools.remake import lease_for
 

@@ -49,7 +49,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.system.process import usable_cores
 from v2v_server.worker.job import ClipJob
-from v2v_server.worker.produce import decode_for
+from v2v_server.worker.making.read import decode_for
 
 BASELINE, LIMIT = "released", "decode"
 # Least multiple of the baseline, by the clock and by processor time, as docs/performance.md reports it, on clips with a

@@ -29,7 +29,8 @@ from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.pixels import VideosKind
 from v2v_server.video.rows import Rows
 from v2v_server.worker.job import SampleJob
-from v2v_server.worker.produce import decode_for, make_sample, open_sidecars
+from v2v_server.worker.making.make import make_sample
+from v2v_server.worker.making.read import decode_for, open_sidecars
 from v2v_tools.remake import lease_for
 
 ROWS = Rows.parse("0.05:0.95")

@@ -18,7 +18,8 @@ from v2v_server.schedule import Schedule, SequenceTable
 from v2v_server.store.cache import Cache
 from v2v_server.video.rows import Rows
 from v2v_server.worker.job import SampleJob
-from v2v_server.worker.produce import decode_for, make_sample
+from v2v_server.worker.making.make import make_sample
+from v2v_server.worker.making.read import decode_for
 from v2v_tools.remake import lease_for
 
 

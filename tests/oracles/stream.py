@@ -25,7 +25,8 @@ from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.schedule import MOST_CANDIDATES, Schedule, SequenceTable, VideoSequence
 from v2v_server.worker.job import SampleJob
-from v2v_server.worker.produce import decode_for, make_sample, open_sidecars
+from v2v_server.worker.making.make import make_sample
+from v2v_server.worker.making.read import decode_for, open_sidecars
 from v2v_tools.remake import lease_for, remake
 
 

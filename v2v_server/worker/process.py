@@ -24,7 +24,7 @@ import secrets
 import signal
 import socket
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from importlib.resources.abc import Traversable
@@ -43,7 +43,7 @@ from v2v_protocol.arena import (
     find_memory,
     open_memory,
 )
-from v2v_protocol.errors import ProtocolError, SidecarError, UsageError, VideoChanged, VideoError, VideoUnreadable
+from v2v_protocol.errors import ProtocolError, SidecarError, UsageError, VideoError
 from v2v_protocol.keys import key_for, leaves_host
 from v2v_protocol.link.dealer import Dealer
 from v2v_protocol.messages import Buffer, Frames, Lease, Notes, Result, WorkerHello, encode_sample
@@ -82,7 +82,9 @@ from v2v_server.worker.conversation import (
 )
 from v2v_server.worker.job import ClipJob, SampleJob
 from v2v_server.worker.logbook import IDLE, note, take_arena
-from v2v_server.worker.produce import Decoded, decode_for, kernels_of, make_sample, open_sidecars
+from v2v_server.worker.making.make import make_sample
+from v2v_server.worker.making.plan import kernels_of
+from v2v_server.worker.making.read import Clips, open_sidecars
 from v2v_server.worker.warm_up import is_compiled, load_in_turn, warm_up_in_turn
 
 Find: TypeAlias = Callable[[ArenaName, bool], int]
@@ -243,62 +245,6 @@ def _map(descriptor: int, offset: int, size: int) -> npt.NDArray[np.uint8]:
     flags = mmap.MAP_SHARED | mmap.MAP_POPULATE
     mapping = mmap.mmap(descriptor, offset - begin + size, flags, offset=begin)
     return np.frombuffer(mapping, np.uint8, size, offset - begin)
-
-
-class Clips:
-    """Decode the clips of samples, together with those of their siblings.
-
-    Args:
-        source: where the videos come from.
-        cache: cache of decoded pieces for later epochs; None stores nothing.
-    """
-
-    def __init__(self, source: VideoSource, cache: Cache | None = None) -> None:
-        self._source = source
-        self._cache = cache
-        self._clip: ClipJob | None = None  # of those that are kept
-        self._kept: dict[int, Decoded] = {}
-
-    def take(self, clip: ClipJob, indices: Sequence[int]) -> tuple[Decoded, bool]:
-        """Return the decoded clip of the first of these samples, and whether it was decoded just now.
-
-        Args:
-            clip: what to decode.
-            indices: of the sample, and of its siblings still to come, which are decoded with it and kept.
-
-        Raises:
-            VideoError: see :func:`v2v_server.worker.produce.decode_for`.
-        """
-        if self.has(clip, indices[0]):
-            return self._kept.pop(indices[0]), False
-        self._clip, self._kept = clip, {}  # siblings that never came
-        if len(indices) > 1:
-            try:
-                first, *others = decode_for(clip, indices, self._source, self._cache)
-            except VideoError:
-                pass  # a sibling may need more of the clip than this sample; try without siblings
-            else:
-                self._kept = dict(zip(indices[1:], others, strict=True))
-                return first, True
-        try:
-            return decode_for(clip, indices[:1], self._source, self._cache)[0], True
-        except (VideoChanged, VideoUnreadable):
-            raise
-        except VideoError:
-            # A decoder may hide a temporary storage error, so try once more. An error of the file repeats.
-            return decode_for(clip, indices[:1], self._source, self._cache)[0], True
-
-    def said_of_cache(self, decoded: Decoded) -> str:
-        """Return the cache field of a sample's header, see :class:`v2v_protocol.messages.SampleHeader`."""
-        if self._cache is None or decoded.clip.origin == "store":
-            return ""
-        if decoded.clip.origin == "cache":
-            return "hit"
-        return f"miss: {self._cache.trouble}" if self._cache.trouble else "miss"
-
-    def has(self, clip: ClipJob, index: int) -> bool:
-        """Return whether a sample of a clip needs no decoding."""
-        return index in self._kept and self._clip == clip
 
 
 class Worker:

@@ -37,7 +37,9 @@ from v2v_server.schedule import Schedule, SequenceTable
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.worker.arrays.context import SampleContext
 from v2v_server.worker.job import ClipJob, SampleJob
-from v2v_server.worker.produce import decode_for, make_sample, plan_sample, sample_context
+from v2v_server.worker.making.make import make_sample, sample_context
+from v2v_server.worker.making.plan import plan_sample
+from v2v_server.worker.making.read import decode_for
 from v2v_tools.remake import lease_for
 from v2v_tools.tradeoff.report import THRESHOLDS
 from v2v_tools.tradeoff.settings import ServeSetting

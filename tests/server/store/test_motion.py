@@ -19,7 +19,8 @@ from v2v_server import motion
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.worker.job import SampleJob
-from v2v_server.worker.produce import decode_for, make_sample
+from v2v_server.worker.making.make import make_sample
+from v2v_server.worker.making.read import decode_for
 
 ROWS, PLANES = "top:0.9", ("motion",)
 RECIPE = Recipe(

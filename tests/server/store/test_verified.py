@@ -35,8 +35,8 @@ from v2v_server.store.picture_sequence import PictureSequence
 from v2v_server.store.pixels import VideosKind
 from v2v_server.store.video_file import VideoFile
 from v2v_server.worker.job import ClipJob, SampleJob
-from v2v_server.worker.process import Clips
-from v2v_server.worker.produce import make_sample
+from v2v_server.worker.making.make import make_sample
+from v2v_server.worker.making.read import Clips
 from v2v_tools.remake import lease_for
 
 FRAMES, CHANGED = 126, 60

@@ -39,8 +39,8 @@ from v2v_server.store.store_file import StoreFile
 from v2v_server.video.picture import Signal, range_table
 from v2v_server.video.rows import Rows
 from v2v_server.worker.job import SampleJob
-from v2v_server.worker.process import Clips
-from v2v_server.worker.produce import make_sample
+from v2v_server.worker.making.make import make_sample
+from v2v_server.worker.making.read import Clips
 from v2v_tools.motion import WholePictures
 from v2v_tools.preview import _signal_note
 from v2v_tools.remake import Remaker, lease_for

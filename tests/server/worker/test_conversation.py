@@ -66,7 +66,8 @@ from v2v_server.worker.conversation import (
     WorkerConversation,
 )
 from v2v_server.worker.job import ClipJob, SampleJob
-from v2v_server.worker.process import Clips, OutputBuffer, Worker, run_worker
+from v2v_server.worker.making.read import Clips
+from v2v_server.worker.process import OutputBuffer, Worker, run_worker
 
 LEASE: Lease = replace(
     example(Lease), indices=(3,), arena="", slot=0, spec=SMALL_SPEC.canonical(), rows="full", arrays=("frames",),

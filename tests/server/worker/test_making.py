@@ -25,10 +25,10 @@ from v2v_server.corpus.sources.folder import Folder
 from v2v_server.corpus.sources.source import sidecar_fingerprint
 from v2v_server.quarantine import QuarantineEntry, quarantine_path, read_quarantine, write_entry
 from v2v_server.schedule import Schedule, SequenceTable
-from v2v_server.worker import process as clips
-from v2v_server.worker import produce
 from v2v_server.worker.job import ClipJob, SampleJob
-from v2v_server.worker.produce import Decoded, decode_for, errors_of_sidecar, make_sample, open_sidecars
+from v2v_server.worker.making import make, read
+from v2v_server.worker.making.make import errors_of_sidecar, make_sample
+from v2v_server.worker.making.read import Clips, Decoded, decode_for, open_sidecars
 from v2v_tools.remake import lease_for, remake
 from v2v_tools.simulate import main as simulate
 
@@ -141,8 +141,8 @@ def test_events_need_no_flow(catalogue: Catalogue, job: SampleJob, monkeypatch: 
     with_flow = changed(job, arrays=("voxels", "flow"))
     decoded = decode_for(with_flow.clip, [job.index], catalogue.source)[0]
     voxels = make_sample(with_flow, decoded).arrays["voxels"]
-    monkeypatch.delattr(produce, "flow_for")
-    events = produce.list_sample_events(with_flow.clip, decoded)
+    monkeypatch.delattr(make, "flow_for")
+    events = make.list_sample_events(with_flow.clip, decoded)
     signs = np.where(events.p, 1, -1)
     assert len(events) > 0
     assert signs.sum() == voxels.sum()
@@ -175,16 +175,16 @@ def test_a_second_attempt(
             raise left.pop(0)
         return decode_for(*arguments)
 
-    monkeypatch.setattr(clips, "decode_for", decode)
+    monkeypatch.setattr(read, "decode_for", decode)
     if is_replaced:
         (catalogue.folder / "a.mp4").write_bytes(b"another")
     if error is None:
-        decoded, _ = clips.Clips(catalogue.source).take(job.clip, [job.index])
+        decoded, _ = Clips(catalogue.source).take(job.clip, [job.index])
         expected = made(job, catalogue)
         assert np.array_equal(make_sample(job, decoded).arrays["voxels"], expected.arrays["voxels"])
     else:
         with pytest.raises(error, match=words):
-            clips.Clips(catalogue.source).take(job.clip, [job.index])
+            Clips(catalogue.source).take(job.clip, [job.index])
 
 
 def test_what_this_host_cannot_read_is_not_made_from_another_video(catalogue: Catalogue) -> None:
@@ -327,7 +327,7 @@ def test_memory_that_labels_take_is_their_error(tmp_path: Path, monkeypatch: pyt
     def short(*_: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr(produce, "open_sidecar", short)
+    monkeypatch.setattr(read, "open_sidecar", short)
     with (
         pytest.raises(SidecarError, match="too much memory"),
         open_sidecars(clip_of(sidecars={ENDING: "3-abc"}), Folder(tmp_path)),
