@@ -20,7 +20,7 @@ from v2v_server.commands.quarantine import main as quarantine
 from v2v_server.commands.serve import main as serve
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.videos import VideoEntry
-from v2v_server.schedule import LARGEST_MEMORY_BYTES, WORKER_BYTES, lease_bytes
+from v2v_server.lease_memory import LARGEST_MEMORY_BYTES, WORKER_BYTES, lease_bytes
 from v2v_server.video.rows import Rows
 
 DEPLOY = Path(__file__).parents[1] / "deploy"

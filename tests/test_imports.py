@@ -59,8 +59,8 @@ PROTOCOL_MAY = {*sys.stdlib_module_names, "numpy", "msgpack", "v2v_protocol"}
 
 
 FLOORS = (
-    "system", "keys", "video", "simulation", "labels", "motion", "flow", "worlds", "store", "config", "corpus",
-    "schedule",
+    "system", "keys", "video", "simulation", "labels", "motion", "flow", "worlds", "store", "kinds", "config", "corpus",
+    "lease_memory", "corpus_words", "schedule",
     "quarantine", "sharing",
     "broker",
     "worker", "supervise", "status", "prepare", "page",
@@ -168,6 +168,8 @@ def test_server_folders_import_only_lower_folders() -> None:
                 "prepare",
                 "quarantine",
                 "schedule",
+                "corpus_words",
+                "lease_memory",
                 "sharing",
                 "keys",
                 "serve",
@@ -193,6 +195,9 @@ def test_every_folder_documents_its_files(room: str) -> None:
         ("v2v_server.simulation.draw", ("torch", "zmq", "av", "numba", "cv2")),
         ("v2v_server.broker.dispatcher", ("torch", "zmq", "numba", "cv2")),
         ("v2v_server.serve", ("torch", "numba", "cv2")),
+        ("v2v_server.worker.process", ("torch", "v2v_server.corpus.index", "v2v_server.schedule")),
+        ("v2v_server.schedule", ("torch", "zmq", "numba", "cv2", "sqlite3")),
+        ("v2v_server.kinds.registry", ("torch", "zmq", "av", "numba", "cv2", "PIL")),
     ],
 )
 def test_what_a_fresh_interpreter_loads(module: str, without: tuple[str, ...]) -> None:
@@ -224,7 +229,7 @@ def test_no_two_classes_constants_or_aliases_have_one_name() -> None:
             for name, definition in (constants(nodes[0]) | classes).items():
                 if name[0].isupper():
                     found.setdefault(name, {})[str(path.relative_to(ROOT))] = definition
-    del found["LOOKED_FOR"]  # of each kind of pixels
+    del found["KIND"]  # of each kind of videos
     assert {
         name: list(used)
         for name, used in found.items()

@@ -47,8 +47,8 @@ from v2v_server.corpus.sources.prepared import (
 )
 from v2v_server.corpus.sources.source import MANIFEST_NAME
 from v2v_server.corpus.videos import VideoEntry
+from v2v_server.kinds.registry import kind_of
 from v2v_server.store.format import DEFAULT_SIZE, SIZES
-from v2v_server.store.pixels import kind_of, open_pixels
 from v2v_server.store.planes import OPTIONAL, whole_cut
 from v2v_server.store.quota import LEAST_FREE_BYTES
 from v2v_server.store.store_file import StoreFile, write_store
@@ -139,14 +139,14 @@ def prepare(
         CorpusError: source and destination overlap, the destination holds something else or was prepared with other
             settings or from another source, a prepared file cannot be read, another process works there, the source is
             a prepared folder itself, or the disk is too full.
-        UsageError: a number of processes below 0, an unknown size, or photographs.
+        UsageError: a number of processes below 0, an unknown size, or a kind of videos that is not prepared.
     """
     if processes < 0:
         raise UsageError(f"{processes} processes: give 0 or more")
     if size not in SIZES:
         raise UsageError(f"size {size!r}: choose one of {', '.join(SIZES)}")
-    if catalogue.source.kind.is_rendered:
-        raise UsageError("photographs are rendered for each sample, so there is nothing to prepare: serve them")
+    if why := catalogue.kind.unprepared:
+        raise UsageError(why)
     tell = progress or (lambda done, total, made, expected: None)
     total = sum(video.frames for video in catalogue.videos)
     tell(0, total, 0, 0)
@@ -555,7 +555,7 @@ def transcode(job: Transcoding) -> Made:
     cut, rate = whole_cut(len(index), job.window, job.planes), job.video.frames_per_second
     written = _Hashes(xxhash.xxh3_128)
     with (
-        open_pixels(job.source, kind_of(job.video.id)) as pixels,
+        kind_of(job.video.id).open_pixels(job.source) as pixels,
         write_aside_and_rename(job.target, partial=hidden) as path,
     ):
         source = Verified(pixels, os.fspath(job.source), {})

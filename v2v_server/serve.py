@@ -40,14 +40,14 @@ from v2v_server.broker.state import (
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogue
 from v2v_server.corpus.scenes.picture_check import check_in_background
+from v2v_server.corpus_words import corpus_summary, notes_of
 from v2v_server.keys import KeyFolder
 from v2v_server.page.child import PageProcess
 from v2v_server.quarantine import QuarantineEntry, quarantine_path, read_quarantine, write_entry
-from v2v_server.schedule import SequenceTable, corpus_summary
+from v2v_server.schedule import SequenceTable
 from v2v_server.status.snapshot import StatusPublisher
 from v2v_server.status.terminal import StatusView, format_shutdown_summary
 from v2v_server.store.cache import make_cache
-from v2v_server.store.pixels import VideosKind
 from v2v_server.supervise.local_host import WorkerProcess
 from v2v_server.supervise.pool import Pool, Scaling, make_pool, question_workers
 from v2v_server.system.log import GIB, Level, Log
@@ -88,7 +88,7 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
             cache_dir=config.cache_dir or None,
             copies=config.copies or None,
             copies_gib=config.copies_gib,
-            kind=VideosKind(config.videos_kind, config.rate, config.photograph_seconds, config.picture_bits),
+            kind=config.kind,
             scene=config.spec.scene != "off",
             # Without local workers all cores are free for probing.
             processes=min(config.most_workers or cores, cores),
@@ -142,7 +142,7 @@ def serve(config: ServeConfig, standbys: list[WorkerProcess] | None = None, debu
         catalogue = load_catalogue(config)
         table = SequenceTable(catalogue.videos, catalogue.rows, config.spec)
         summary = corpus_summary(catalogue, config.spec, table, list_refused=config.list_refused)
-        for line in (*catalogue.notes, *summary):
+        for line in (*notes_of(catalogue), *summary):
             log.say(line)
         config.spec.recipe.warn(log.say)
         catalogue.fail_fast()
@@ -168,8 +168,8 @@ def serve(config: ServeConfig, standbys: list[WorkerProcess] | None = None, debu
         if config.cache:
             worker_flags += ["--cache", str(Path(config.cache).absolute()), "--cache-gib", str(config.cache_gib)]
         worker_flags += ["--debug"] * debug + ["--insecure"] * config.insecure
-        copies, gib = catalogue.source.copies_options
-        worker_flags += ["--copies", str(copies), "--copies-gib", str(gib)] if copies else []
+        if copies := catalogue.source.copies:
+            worker_flags += ["--copies", str(copies.folder), "--copies-gib", str(copies.most_bytes / GIB)]
         stop = threading.Event()
         sockets.has_session = dispatcher.has_session
         signals = opened.enter_context(stop_on_signals(stop))

@@ -15,9 +15,9 @@ from v2v_server.broker import dispatcher
 from v2v_server.broker.dispatcher import next_candidate
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogue
+from v2v_server.kinds.kind import VideosKind
 from v2v_server.quarantine import Quarantine
 from v2v_server.schedule import MOST_CANDIDATES, Schedule, SequenceTable, VideoSequence
-from v2v_server.store.pixels import VideosKind
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
 from v2v_server.worker.job import SampleJob

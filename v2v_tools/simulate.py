@@ -21,8 +21,8 @@ from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import add_spec, asked_recipe, recipe_setting, spec_fields
 from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.config import ServeConfig
+from v2v_server.kinds.registry import KindFlags, kind_from
 from v2v_server.quarantine import Quarantine, quarantine_path, read_quarantine
-from v2v_server.store.pixels import VideosKind
 from v2v_server.worker.making.make import list_sample_events
 from v2v_tools.event_files import EVENT_WRITERS, check_event_file, write_events
 from v2v_tools.remake import Remaker, open_shown
@@ -53,9 +53,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         metavar="N",
         help="number of the quarantine snapshot in the sample's provenance",
     )
-    parser.add_settings(
-        ServeConfig, "list", "rows", "videos_kind", "rate", "photograph_seconds", "picture_bits", "cache_dir"
-    )
+    parser.add_settings(ServeConfig, "list", "rows", "cache_dir")
+    parser.add_settings(KindFlags)
     out = parser.group("Output")
     parser.add_output(
         "Output", "--out", (".npz",), "output file for the arrays and the provenance (JSON)", required=True
@@ -88,7 +87,7 @@ def _run(asked: argparse.Namespace) -> None:
         check_event_file(asked.events, spec.recipe.crop_width_px, spec.recipe.crop_height_px)
     catalogue = open_shown(
         asked.video, list_file=asked.list, rows=asked.rows or "full", scene=spec.scene != "off",
-        cache_dir=asked.cache_dir, kind=VideosKind.of(vars(asked)),
+        cache_dir=asked.cache_dir, kind=kind_from(vars(asked)),
     )  # fmt: skip
     path = quarantine_path(catalogue.source.name, asked.cache_dir)
     quarantine = read_quarantine(path) if asked.quarantine else Quarantine()

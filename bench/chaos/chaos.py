@@ -38,8 +38,8 @@ from tests.oracles.stream_log import BatchLine, Kill, read_log, recovery_seconds
 from v2v_client.loadtest import percentile
 from v2v_protocol.command import Parser
 from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.kinds.registry import VIDEOS
 from v2v_server.quarantine import quarantine_path, read_quarantine
-from v2v_server.store.video_file import id_of
 
 _POLL_SECONDS = 0.05
 _LAST_BATCH_SECONDS = 120.0
@@ -187,5 +187,5 @@ def measure(asked: argparse.Namespace) -> Report:
         if asked.large:
             fleet.add_worker()  # it waits for the server
         # Two SIGSEGVs quarantine a video: one video must remain.
-        most_segv = sum(bool(id_of(path.name)) for path in videos.rglob("*")) - 1
+        most_segv = sum(bool(VIDEOS.id_of(path.name)) for path in videos.rglob("*")) - 1
         return run_fleet(fleet, Chaos(fleet, asked.every, asked.seed, most_segv, kinds), asked)

@@ -34,10 +34,11 @@ from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import index_path, open_catalogue
-from v2v_server.corpus.index import Figures, IndexRow, Store
+from v2v_server.corpus.index import Figures, Store
 from v2v_server.corpus.probe import SceneCollection, figures, probe_file
 from v2v_server.corpus.scenes.scene import COLUMNS, MOST_ANALYSED_FRAMES, SEGMENT_FRAMES, Scene
 from v2v_server.corpus.sources.folder import Folder
+from v2v_server.corpus.videos import IndexRow
 from v2v_server.schedule import SequenceTable
 from v2v_server.system.process import resident_bytes, usable_cores
 from v2v_server.video.rows import Rows

@@ -26,9 +26,9 @@ from v2v_protocol.command import Parser
 from v2v_protocol.sample import DEFAULT_ARRAYS
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.kinds.photographs import PhotographKind
 from v2v_server.prepare import prepare
 from v2v_server.store import photograph
-from v2v_server.store.pixels import VideosKind
 from v2v_server.worlds.clip import TRUTH
 from v2v_server.worlds.world import draw_world
 from v2v_tools.remake import RemadeSample, Remaker
@@ -65,7 +65,7 @@ def turns(asked: argparse.Namespace, folder: Path) -> Iterator[dict[str, float]]
     with closing(open_catalogue(asked.videos, processes=0)) as videos:
         progress("preparing the dense store")
         prepare(videos, folder / "store", "dense", processes=0)
-    kind, spec = VideosKind("photographs"), StreamSpec.from_dict({"preset": "worlds"})
+    kind, spec = PhotographKind(), StreamSpec.from_dict({"preset": "worlds"})
     spec = StreamSpec.from_dict({"recipe": spec.recipe.replace(world_patches=PATCHES)})
     with (
         closing(open_catalogue(folder / "store", cache_dir=folder, processes=0)) as store,

@@ -12,6 +12,7 @@ from v2v_protocol.recipe import EFFECTS_SECTION, PRESET_FIELDS, STREAM_PRESETS, 
 from v2v_protocol.settings import Setting, settings_of
 from v2v_protocol.spec import StreamSpec
 from v2v_server.config import ServeConfig
+from v2v_server.kinds.registry import KindFlags
 
 HEAD = """# All keys
 
@@ -70,7 +71,7 @@ def page() -> str:
     """Return the whole page."""
     return "\n".join([
         HEAD,
-        *_section("Server", ServeConfig),
+        *_section("Server", ServeConfig, KindFlags),
         *_section("Stream", StreamSpec),
         "### Stream presets: `preset`\n",
         *_presets(STREAM_PRESETS),
@@ -81,9 +82,10 @@ def page() -> str:
     ])  # fmt: skip
 
 
-def _section(title: str, cls: type[Any]) -> Iterator[str]:
+def _section(title: str, *classes: type[Any]) -> Iterator[str]:
     yield f"## {title}\n"
-    shown = [(name, setting) for name, setting in settings_of(cls).items() if not setting.is_hidden]
+    settings = (row for each in classes for row in settings_of(each).items())
+    shown = [(name, setting) for name, setting in settings if not setting.is_hidden]
     for group, rows in groupby(shown, key=lambda row: row[1].group):
         if group != title:
             yield f"### {group}\n"

@@ -23,10 +23,11 @@ from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED, Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.kinds.photographs import PhotographKind
+from v2v_server.kinds.videos import VideoKind
 from v2v_server.prepare import prepare
 from v2v_server.schedule import Schedule, SequenceTable
 from v2v_server.store.cache import Cache, make_cache
-from v2v_server.store.pixels import VideosKind
 from v2v_server.video.rows import Rows
 from v2v_server.worker.job import SampleJob
 from v2v_server.worker.making.make import make_sample
@@ -210,7 +211,7 @@ class Ways:
             is_video = name != "photographs"
             if name not in ("videos", "photographs"):
                 self._prepare(name)
-            rows, kind = ROWS if name == "videos" else None, VideosKind() if is_video else VideosKind("photographs")
+            rows, kind = ROWS if name == "videos" else None, VideoKind() if is_video else PhotographKind()
             self._catalogues[name] = open_catalogue(
                 self.folder / name, rows=rows, cache_dir=self.folder, processes=0, scene=is_video, kind=kind
             )

@@ -87,16 +87,9 @@ from v2v_server.broker.state import (
     malformed,
 )
 from v2v_server.corpus.videos import CorpusFacts, VideoEntry
+from v2v_server.lease_memory import LARGEST_MEMORY_BYTES, MOST_CLIP_BYTES, lease_bytes
 from v2v_server.quarantine import QuarantineEntry
-from v2v_server.schedule import (
-    LARGEST_MEMORY_BYTES,
-    MOST_CANDIDATES,
-    MOST_CLIP_BYTES,
-    Schedule,
-    SequenceTable,
-    VideoSequence,
-    lease_bytes,
-)
+from v2v_server.schedule import MOST_CANDIDATES, Schedule, SequenceTable, VideoSequence
 from v2v_server.sharing import SharedSample
 
 MOST_SESSIONS = 4096

@@ -35,7 +35,7 @@ from v2v_protocol.arena import Slot
 from v2v_protocol.liveness import Liveness
 from v2v_protocol.messages import Notes, Result, WorkerHello
 from v2v_protocol.sample import Refusal
-from v2v_server.schedule import LARGEST_MEMORY_BYTES
+from v2v_server.lease_memory import LARGEST_MEMORY_BYTES
 
 ALONE_AFTER = 2
 """Number of unexplained losses after which a sample runs alone."""

@@ -22,10 +22,10 @@ from v2v_protocol.spec import SCENES
 from v2v_protocol.write_aside import JSON, write_json
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.corpus.sources.source import LIST_SUFFIXES
+from v2v_server.corpus.sources.lists import LIST_SUFFIXES
+from v2v_server.kinds.registry import KindFlags, kind_from
 from v2v_server.prepare import Report, check_destination, prepare
 from v2v_server.store.format import DEFAULT_SIZE, SIZES
-from v2v_server.store.pixels import VideosKind
 from v2v_server.store.planes import OPTIONAL, PLANES
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
@@ -53,7 +53,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         default="off",
         help="auto: also compute the statistics that v2v-serve --scene auto uses",
     )
-    parser.add_settings(ServeConfig, "list", "rows", "videos_kind", "rate", "picture_bits", "cache_dir")
+    parser.add_settings(ServeConfig, "list", "rows", "cache_dir")
+    parser.add_settings(KindFlags)
     stored = parser.group("Files")
     stored.add_argument(
         "--size", choices=tuple(SIZES), default=DEFAULT_SIZE,
@@ -90,7 +91,7 @@ def _run(arguments: argparse.Namespace) -> int:
             list_file=arguments.list,
             rows=Rows.parse(arguments.rows or "full"),
             cache_dir=arguments.cache_dir,
-            kind=VideosKind.of(vars(arguments)),
+            kind=kind_from(vars(arguments)),
             processes=arguments.workers,
             progress=probing,
             notice=probing.notice,

@@ -76,7 +76,8 @@ def _run(arguments: argparse.Namespace, argv: Sequence[str]) -> None:
     source = open_source(
         arguments.videos, SourceOptions(copies=arguments.copies, copies_gib=arguments.copies_gib or COPIES_GIB)
     )
-    source.make()
+    if source.copies is not None:
+        source.copies.make()
     cache = None
     if arguments.cache is not None:
         folder = Path(arguments.cache)

@@ -29,21 +29,16 @@ import xxhash
 from v2v_protocol.errors import UsageError, VideoError, VideoUnreadable
 from v2v_protocol.persisted import Persisted
 from v2v_protocol.programs import counted, printable
-from v2v_server.corpus.index import FigureKind, Figures, IndexRow, Store
+from v2v_server.corpus.index import FigureKind, Figures, Store
 from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, MOST_ANALYSED_FRAMES, PIECE, Scene
-from v2v_server.corpus.sources.prepared import Manifest
-from v2v_server.corpus.sources.source import (
-    Notice,
-    VideoSource,
-    by_parts,
-    files_between,
-    open_sidecar,
-    read_files,
-    sidecar_id,
-)
-from v2v_server.corpus.videos import Sidecars, SplitVideos, VideoTable, encoded_pieces, joined
+from v2v_server.corpus.sources.prepared import Manifest, manifest_of
+from v2v_server.corpus.sources.questions import Notice, by_parts
+from v2v_server.corpus.sources.sidecars import files_between, open_sidecar, read_files, sidecar_id
+from v2v_server.corpus.sources.source import VideoSource, rate_of
+from v2v_server.corpus.videos import IndexRow, Sidecars, SplitVideos, VideoTable, encoded_pieces, joined
+from v2v_server.kinds.kind import VideosKind
+from v2v_server.kinds.registry import VIDEOS, kind_of
 from v2v_server.labels import check_labels
-from v2v_server.store.pixels import kind_of, open_pixels
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated, run_twice
 from v2v_server.video.decode import ClipRequest, Cut
@@ -60,8 +55,6 @@ LARGEST_PROBE_BYTES = 2 << 30
 """Memory that a process may allocate to probe a file: enough for 16 pictures of the largest size, or a list of 2**24
 frames. A file of some kB can claim a thousand million frames, for which a demuxer would allocate memory."""
 
-_QUESTIONED_BITS = 14
-"""Pictures of 16 bits that need no more than these are questioned."""
 _MOST_TOGETHER = 1024
 _MOST_SECONDS = 10.0
 VideoProgress = Callable[[int, int], None]
@@ -76,17 +69,19 @@ def probe_file(source: VideoSource, id: str) -> IndexRow:
 
     A file that cannot be read gets the size -1, which no file has: it is probed again at the next start.
     """
-    if kind_of(id) == "photographs" and not source.kind.is_rendered:
-        return IndexRow(id, -1, problem="is a picture: add --videos-kind photographs")
+    kind, owner = source.kind, kind_of(id)
+    if owner.unprepared and owner.name != kind.name:  # what can be prepared may be a store, which needs no flag
+        return IndexRow(id, -1, problem=f"is {owner.help}: add --videos-kind {owner.name}")
     try:
         before = source.state(id)
         with source.open_local(id, "") as path:
             mark = fingerprint(path)
-            facts = _timed(_levelled(_facts(path, source.kind.videos_kind), source.kind.picture_bits), source, id)
+            facts = kind.with_flags(_facts(path, kind), rate_of(source, id))
         name = facts.made_of or (f"{mark}-{facts.content}" if facts.content else mark)
         if source.state(id) != before:
             return IndexRow(id, -1, problem="changes while it is read; the next start tries again")
-        source.keep_as(id, mark, name)
+        if source.copies is not None:
+            source.copies.keep_as(id, mark, name)
     except OSError as error:
         return IndexRow(id, -1, problem=f"cannot be read: {error.strerror or error}")
     except VideoUnreadable as error:
@@ -111,45 +106,13 @@ def probe_file(source: VideoSource, id: str) -> IndexRow:
     )
 
 
-def facts_of(path: Path, kind: str = "videos") -> VideoFacts:
+def facts_of(path: Path, kind: VideosKind = VIDEOS) -> VideoFacts:
     """Return what is known of the video in a file. Errors: :class:`v2v_server.store.pixels.Pixels`."""
-    with open_pixels(path, kind) as pixels:
+    with kind.open_pixels(path) as pixels:
         return pixels.facts()
 
 
-def _timed(facts: VideoFacts, source: VideoSource, id: str) -> VideoFacts:
-    """Return the facts of pictures that follow each other at a rate that the user states, if they state no times; those
-    of a photograph, of all frames that it is shown for.
-    """
-    rate, frames = source.rate(id), source.kind.frames if source.kind.is_rendered else facts.frames
-    if not rate or facts.index.seekable:
-        return facts
-    index = facts.index.timed(np.rint(np.arange(frames) * 1e9 / rate).astype(np.int64))
-    content = f"{facts.content}@{rate:g}"
-    return replace(facts, frames=frames, frames_per_second=rate, index=index, content=content)
-
-
-def _levelled(facts: VideoFacts, bits: int) -> VideoFacts:
-    """Return the facts of pictures of 16 bits that hold fewer, if the user states it; otherwise ask whether they do.
-
-    Raises:
-        VideoError: they hold more.
-    """
-    highest, remark = facts.highest_level, ""
-    if bits and highest >> bits > 0:
-        raise VideoError("", None, f"has a level of {highest}, beyond those of --picture-bits {bits}")
-    if bits and highest >= 0:
-        return replace(facts, index=replace(facts.index, bits=bits), content=f"{facts.content}~{bits}")
-    if bits and not facts.made_of:
-        remark = f"--picture-bits {bits} does not apply: its pictures do not have 16 bits"
-    elif 0 <= highest < 1 << _QUESTIONED_BITS:
-        least = max(8, highest.bit_length())
-        remark = f"no level above {highest} of 65535 in the pictures looked at: if they hold {least} bits, they are "
-        remark += f"{1 << 16 - least} times too dark, and --picture-bits {least} stretches them"
-    return replace(facts, remark="; ".join(filter(None, (facts.remark, remark))))
-
-
-def _facts(path: Path, kind: str) -> VideoFacts:
+def _facts(path: Path, kind: VideosKind) -> VideoFacts:
     """Return what is known of the video; retry once after an error of the system rather than of the decoder.
 
     Raises:
@@ -318,10 +281,10 @@ class SceneCollection:
     def _found(
         self, store: Store, source: VideoSource, table: VideoTable, missing: list[int], processes: int
     ) -> Generator[tuple[IndexRow | _SceneJob, Scene], None, None]:
-        left = []
+        left, manifest = [], manifest_of(source)
         for place in missing:
             record = table.row(place)
-            if (data := self._stated(source.manifest, record)) is None:
+            if (data := self._stated(manifest, record)) is None:
                 left.append(place)
             else:
                 yield record, Scene.from_bytes(data)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
-from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -18,7 +17,6 @@ import xxhash
 
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.store.picture_sequence import errors_of_pictures
-from v2v_server.store.pixels import IMAGE_SUFFIXES
 from v2v_server.video.decode import BIT_EXACT_CODECS, ClipRequest, Cut, DecodedClip, DecodedFrame, DecodedPicture
 from v2v_server.video.fingerprint import check_content, check_fingerprint
 from v2v_server.video.frame_index import LARGEST_INDEXED_SIDE_PX, FrameIndex, unseekable
@@ -36,17 +34,11 @@ from v2v_server.video.source import LARGEST_PICTURE_PX
 if TYPE_CHECKING:
     from v2v_server.worlds.render import PhotoPyramid
 
-LOOKED_FOR = " ".join(sorted(IMAGE_SUFFIXES))
 _LEAST_SIDE_PX = 16
 _MODES = frozenset({"1", "L", "LA", "P", "PA", "RGB", "RGBA", "I;16", "I;16B"})
 """Pillow's names of the pixels that are read: grey, palettes and RGB."""
 _KEPT_BYTES = 256 << 20
 """Decoded photographs that a worker keeps; one at least."""
-
-
-def id_of(path: str) -> str:
-    """Return the id of the photograph in a file, its path; "" for other files."""
-    return path if PurePosixPath(path).suffix.lower() in IMAGE_SUFFIXES else ""
 
 
 class _Still(NamedTuple):

@@ -48,8 +48,9 @@ from v2v_protocol.keys import key_for, leaves_host
 from v2v_protocol.link.dealer import Dealer
 from v2v_protocol.messages import Buffer, Frames, Lease, Notes, Result, WorkerHello, encode_sample
 from v2v_protocol.sample import Form, Layout, new_arrays
-from v2v_server.corpus.sources.source import VideoSource, sidecar_id
-from v2v_server.schedule import LARGEST_MEMORY_BYTES
+from v2v_server.corpus.sources.sidecars import sidecar_id
+from v2v_server.corpus.sources.source import VideoSource
+from v2v_server.lease_memory import LARGEST_MEMORY_BYTES
 from v2v_server.simulation.precision import USUAL
 from v2v_server.store.cache import Cache
 from v2v_server.system.compile_cache import compile_cache
@@ -411,7 +412,7 @@ class Worker:
         if self._clips.has(clip, index):
             return True
         files = _files(clip)
-        self._source.expect(clip.video, clip.state)
+        self._source.expected = clip.video, clip.state
         return (self._unfetched is not None and self._unfetched[0] == files) or self._source.has(files)
 
     def _fetch(self, clip: ClipJob, index: int) -> None:

@@ -27,7 +27,8 @@ from packaging.requirements import Requirement
 from v2v_protocol.command import FAILED, Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.programs import show, version_of
-from v2v_server.store.pixels import PIXEL_KINDS, VideosKind
+from v2v_server.kinds.kind import VideosKind
+from v2v_server.kinds.registry import KindFlags, kind_from
 from v2v_server.system.process import control_group_memory, usable_cores
 from v2v_server.system.sandbox import can_confine
 
@@ -248,13 +249,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     what.add_argument("--port", type=int, default=5555, metavar="N", help="port that a server would use (default 5555)")
     what.add_argument("--rows", default="full", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid)")
-    what.add_argument("--videos-kind", choices=PIXEL_KINDS, help="what a video is, as for v2v-serve (default videos)")
-    what.add_argument("--rate", type=float, metavar="N", help="rate of picture sequences, or of photographs, Hz")
-    what.add_argument("--photograph-seconds", type=float, metavar="S", help="time for which each photograph is shown")
-    what.add_argument(
-        "--picture-bits", type=int, metavar="N", help="bits that 16-bit pictures of sequences hold, 8 to 15"
-    )
     what.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
+    parser.add_settings(KindFlags)
     return run_command(parser, _run, argv, failures=(V2VError,))
 
 
@@ -264,7 +260,7 @@ def _run(arguments: argparse.Namespace) -> int:
     found_bad = has_defects = False
     for finding in run_checks(
         arguments.port, arguments.videos, arguments.recipe, arguments.rows, arguments.cache_dir,
-        VideosKind.of(vars(arguments)),
+        kind_from(vars(arguments)),
     ):  # fmt: skip
         found_bad = found_bad or finding.level == BAD
         has_defects = has_defects or (finding.level, finding.about) == (NOTE, "pictures")

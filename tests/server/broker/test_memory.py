@@ -10,7 +10,7 @@ from v2v_protocol.messages import Ping, Pong
 from v2v_protocol.sample import array_layout, layout_bytes
 from v2v_server.broker.dispatcher import TOO_LARGE_SECONDS
 from v2v_server.broker.leases import ALONE_AFTER, Cause
-from v2v_server.schedule import LARGEST_MEMORY_BYTES, lease_bytes
+from v2v_server.lease_memory import LARGEST_MEMORY_BYTES, lease_bytes
 
 MIB = 1 << 20
 BIG = video("big.mp4", height_px=2160, width_px=3840)

@@ -27,12 +27,12 @@ from v2v_server.corpus import probe
 from v2v_server.corpus import videos as columns
 from v2v_server.corpus import videos as videos_module
 from v2v_server.corpus.catalogue import Catalogue, index_path, open_catalogue
-from v2v_server.corpus.index import FigureKind, Figures, IndexRow, Store
+from v2v_server.corpus.index import FigureKind, Figures, Store
 from v2v_server.corpus.probe import SceneCollection, figures
 from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, COLUMNS, Flag, Scene
 from v2v_server.corpus.sources.folder import Folder
-from v2v_server.corpus.sources.source import silent
-from v2v_server.corpus.videos import NO_THRESHOLDS, SplitVideos, Thresholds, Videos, VideoTable, joined
+from v2v_server.corpus.sources.questions import silent
+from v2v_server.corpus.videos import NO_THRESHOLDS, IndexRow, SplitVideos, Thresholds, Videos, VideoTable, joined
 from v2v_server.video.rows import Rows
 
 KIND = SceneCollection(Rows()).kind

@@ -21,7 +21,7 @@ from contextlib import closing
 from v2v_protocol.sample import DEFAULT_ARRAYS, array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.schedule import lease_bytes
+from v2v_server.lease_memory import lease_bytes
 from v2v_server.worker.warm_up import warm_up_in_turn
 from v2v_tools.remake import Remaker
 

@@ -167,7 +167,7 @@ PLANE = Peaks(version=1, dtype="|u1", values=1, cell_px=8, serves="peaks")
 '''
 
 LINES = (
-    ("v2v_server/store/pixels.py", '"store_file", "video_file"', '"toy_raw", "toy_world", '),
+    ("v2v_server/kinds/videos.py", '"store_file", "video_file"', '"toy_raw", "toy_world", '),
     ("v2v_server/store/planes/__init__.py", '"motion", "detail"', '"peaks", '),
 )
 

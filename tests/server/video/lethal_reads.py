@@ -6,9 +6,9 @@ import os
 import signal
 import stat
 
-from v2v_server.corpus.index import IndexRow
 from v2v_server.corpus.probe import probe_file
 from v2v_server.corpus.sources.source import VideoSource
+from v2v_server.corpus.videos import IndexRow
 
 
 def lethal(source: VideoSource, id: str) -> IndexRow:

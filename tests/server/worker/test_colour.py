@@ -31,6 +31,7 @@ from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.scenes import picture_check
 from v2v_server.corpus.sources.folder import Folder
+from v2v_server.corpus_words import notes_of
 from v2v_server.prepare import prepare
 from v2v_server.simulation.intensity import light_table
 from v2v_server.store.cache import Cache, make_cache
@@ -131,7 +132,7 @@ def test_a_prepared_folder_has_colour_with_chroma_alone_whatever_else_it_has(tmp
         assert stored.planes >= {"chroma", "motion"}
     (prepared / "b.mp4").unlink()
     with closing(open_catalogue(prepared, processes=0)) as catalogue:
-        assert catalogue.notes
+        assert notes_of(catalogue)
         catalogue.facts.require_arrays(("frames_rgb",))
 
 

@@ -22,7 +22,7 @@ from v2v_protocol.sample import ArrayForm, Needs, Refusal, Sample
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.sources.folder import Folder
-from v2v_server.corpus.sources.source import sidecar_fingerprint
+from v2v_server.corpus.sources.sidecars import sidecar_fingerprint
 from v2v_server.quarantine import QuarantineEntry, quarantine_path, read_quarantine, write_entry
 from v2v_server.schedule import Schedule, SequenceTable
 from v2v_server.worker.job import ClipJob, SampleJob

@@ -1,7 +1,11 @@
 """Where the videos of a corpus come from: one file for each kind of source, named in ``source.SOURCE_KINDS``.
 
-source    what every source can do; sidecars, list files, and asking about many files at a time
-folder    a folder, a video or a list file on this host
-prepared  a folder that v2v-prepare made
-copies    an address in object storage, and a folder of copies on this host
+source       what every source can do
+folder       a folder, a video or a list file on this host
+prepared     a folder that v2v-prepare made, and its manifest
+copies       an address in object storage
+copy_folder  copies of files that lie elsewhere, in a folder of this host
+lists        list files, and files that nothing asks for
+sidecars     files and folders beside a video that arrays are made from
+questions    asking about many files at a time
 """

@@ -1,10 +1,5 @@
 """Videos in object storage, each fetched once to a folder of this host.
 
-A copy is named by a hash of address, id and fingerprint, so a changed object gets another name, and the content of a
-name is what was catalogued. Any number of processes share a folder. The process that fetches a video holds a lock that
-the others wait for, writes under another name, and renames. A reader holds a shared lock on its copy, which eviction
-respects. If space runs out, the least recently read copies are evicted.
-
 Each store has exceptions of its own. Here they become the three of every source: gone, denied, and everything else,
 which may pass.
 """
@@ -12,8 +7,6 @@ which may pass.
 from __future__ import annotations
 
 import contextlib
-import errno
-import fcntl
 import hashlib
 import os
 import posixpath
@@ -24,11 +17,12 @@ from array import array
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from functools import cached_property
 from importlib import import_module
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
-from typing import IO, Any, TypeVar
+from typing import Any, TypeVar
 from zipfile import Path as ZipPath
 from zipfile import ZipFile
 
@@ -42,25 +36,25 @@ from v2v_protocol.errors import (
     VideoUnreadable,
 )
 from v2v_protocol.programs import printable
+from v2v_server.corpus.sources.copy_folder import CopyFolder
+from v2v_server.corpus.sources.lists import ListEntry, count_left_out
+from v2v_server.corpus.sources.questions import answers
+from v2v_server.corpus.sources.sidecars import is_sidecar, sidecar_fingerprint, state_of_parts, state_text
 from v2v_server.corpus.sources.source import (
     GONE,
     MANIFEST_NAME,
     NO_STATE,
     UNPRINTABLE,
     FileState,
-    ListEntry,
     SourceOptions,
     VideoSource,
-    answers,
-    count_left_out,
-    is_sidecar,
-    sidecar_fingerprint,
-    state_text,
+    is_expected,
+    mark_of,
 )
-from v2v_server.store.pixels import PIXEL_KINDS, VideosKind, kind_of, open_pixels
-from v2v_server.store.quota import MOST_GIB, PARTIAL, QuotaFolder
+from v2v_server.kinds.registry import KINDS, kind_of
+from v2v_server.store.quota import MOST_GIB
 from v2v_server.store.verified import content_of
-from v2v_server.system.process import cache_folder, locked, make_private
+from v2v_server.system.process import cache_folder
 from v2v_server.video.fingerprint import TIMES_ABOVE, check_content, is_same_file
 from v2v_server.video.fingerprint import fingerprint as video_fingerprint
 
@@ -228,15 +222,6 @@ def _state(info: dict[str, Any]) -> FileState:
 
 _ZIP_EPOCH = 315_619_200
 """A time that archives can state, 1980-01-02, in seconds since 1970."""
-_SLOTS = 64
-"""Videos that a host can fetch at a time, and so the most unfinished files that killed processes leave behind."""
-_LOCK_SECONDS = 30.0
-"""Longest wait for another process that evicts copies. No lease has begun yet, so no video is blamed for it."""
-_SLOT_SECONDS = 20.0
-"""Longest wait for another process that fetches a video of the same slot. Then the next free slot is used: the process
-may be stopped, and fetching one video twice costs less than a waiting worker."""
-_ROOM_SECONDS = 2.0
-"""Wait before the next try if all copies are being read."""
 
 
 class Copies(VideoSource):
@@ -244,8 +229,7 @@ class Copies(VideoSource):
 
     Args:
         bucket: where the videos come from.
-        copies: folder of the copies; other corpora may share it.
-        most_bytes: limit of the folder.
+        copies, most_bytes: see :class:`CopyFolder`.
         listed: reads the videos to take from the address; None takes all.
     """
 
@@ -259,14 +243,8 @@ class Copies(VideoSource):
         listed: Callable[[], tuple[ListEntry, ...] | None] = lambda: None,
     ) -> None:
         super().__init__(bucket.url, listed)
-        self.bucket, self.copies, self.most_bytes = bucket, copies, most_bytes
-        self._quota = QuotaFolder(copies, most_bytes, _LOCK_SECONDS)
-        self._at_hand: dict[tuple[str, str], IO[bytes]] = {}
-
-    @property
-    def copies_options(self) -> tuple[Path, float]:
-        """Return the folder of copies and its limit, see :attr:`VideoSource.copies_options`."""
-        return self.copies, self.most_bytes / (1 << 30)
+        self.bucket = bucket
+        self.copies: CopyFolder = CopyFolder(bucket.url, copies, most_bytes, self._write)
 
     @cached_property
     def _objects(self) -> dict[str, FileState]:
@@ -290,14 +268,14 @@ class Copies(VideoSource):
         for name in self._objects:
             if name.rpartition("/")[2] == MANIFEST_NAME:
                 raise CorpusError(f"{self}: {name} makes it a prepared corpus: copy that to a disk")
-        if self.listed is not None:
-            yield from (entry.id for entry in self.listed)
+        if (listed := self.listed()) is not None:
+            yield from (entry.id for entry in listed)
             return
         for name in self._objects:
             parts = name.split("/")
             if any(part.startswith(".") for part in parts):
                 continue
-            if not (id := self.kind.form.id_of(name)) and self.kind.form.id_of(name.partition("?")[0]):
+            if not (id := self.kind.id_of(name)) and self.kind.id_of(name.partition("?")[0]):
                 refused[printable(name)] = "is a link with a query, which is not followed: link to the file itself"
             elif not id:
                 count_left_out(parts[-1], left_out)
@@ -307,17 +285,6 @@ class Copies(VideoSource):
                 refused[name] = "has an empty part between two slashes, or is a picture outside of a folder"
             else:
                 yield id
-
-    def make(self) -> None:
-        """Create the folder of copies.
-
-        Raises:
-            CorpusError: it cannot be created or written to.
-        """
-        try:
-            self._quota.make()
-        except OSError as error:
-            raise CorpusError(f"--copies {self.copies}: cannot be written to: {error.strerror or error}") from error
 
     def states(self, ids: Sequence[str]) -> array[int]:
         """Return the states of many objects, from the listing."""
@@ -333,9 +300,9 @@ class Copies(VideoSource):
             VideoUnreadable: the store does not answer, or has no such object.
         """
         if id.endswith("/"):
-            return self.state_of_parts(id, self._parts(id, listed, tries))
+            return state_of_parts(self, id, self._parts(id, listed, tries))
         size, content, _ = self.bucket.state(id, tries) if listed is None else listed.get(id, GONE)
-        return size, content, self.mark(id)
+        return size, content, mark_of(self, id)
 
     def _parts(
         self, id: str, listed: Mapping[str, FileState] | None = None, tries: int = TRIES
@@ -391,137 +358,37 @@ class Copies(VideoSource):
             yield id
 
     def has(self, files: Mapping[str, str]) -> bool:
-        """Return whether the copies are there. If so, they stay until others are asked for, or fetched."""
-        if self._at_hand.keys() == files.items():
-            return True
-        held: dict[tuple[str, str], IO[bytes]] = {}
-        for id, fingerprint in files.items():
-            copy = self._hold(self._path(id, fingerprint))
-            if copy is None:
-                _close(held)
-                return False
-            held[id, fingerprint] = copy
-        self.release()
-        self._at_hand = held
-        return True
+        """Return whether the copies are there, see :meth:`CopyFolder.has`."""
+        return self.copies.has(files)
 
     def fetch(self, files: Mapping[str, str]) -> None:
-        """Fetch the copies that are missing; afterwards :meth:`has` returns True.
+        """Fetch the copies that are missing, see :meth:`CopyFolder.fetch`."""
+        self.copies.fetch(files)
+
+    def open_local(self, id: str, fingerprint: str) -> AbstractContextManager[Path]:
+        """Lend the copy of a video, see :meth:`CopyFolder.lend`."""
+        return self.copies.lend(id, fingerprint)
+
+    def _write(self, id: str, fingerprint: str, slot: Path) -> str:
+        """Fetch a file, and return its fingerprint.
 
         Raises:
-            VideoUnreadable: one cannot be fetched.
-            VideoChanged: an object is another one by now.
+            VideoUnreadable: the store does not deliver it.
+            VideoChanged: it is another one by now.
         """
-        self.release()
-        for id, fingerprint in files.items():
-            self._at_hand[id, fingerprint] = self._get(id, fingerprint)
-
-    @contextlib.contextmanager
-    def open_local(self, id: str, fingerprint: str) -> Iterator[Path]:
-        """Lend the copy of a video until the end of the context.
-
-        Args:
-            fingerprint: of the video as catalogued; "" fetches what is there now.
-
-        Raises:
-            VideoUnreadable, VideoChanged: see :meth:`fetch`.
-        """
-        if (id, fingerprint) in self._at_hand:
-            yield self._path(id, fingerprint)
-            return
-        held = self._hold(self._path(id, fingerprint)) if fingerprint else None
-        if held is None:
-            self.release()
-            held = self._get(id, fingerprint)
-        with held:
-            yield Path(held.name)
-
-    def keep_as(self, id: str, found: str, fingerprint: str) -> None:
-        """See :meth:`VideoSource.keep_as`."""
-        # A link, because another process may be reading the copy under its first name, which then stays.
-        with contextlib.suppress(OSError), self._locked_slot(_slot_number(id)) as slot:
-            slot.unlink(missing_ok=True)
-            try:
-                slot.hardlink_to(self._path(id, found))
-                self._quota.remove(self._path(id, found))
-                self._quota.add(slot, self._path(id, fingerprint), evicts=True)
-            finally:
-                slot.unlink(missing_ok=True)
-
-    def release(self) -> None:
-        """Allow eviction of the copies that :meth:`has` or :meth:`fetch` keeps."""
-        _close(self._at_hand)
-        self._at_hand = {}
-
-    def _path(self, id: str, fingerprint: str) -> Path:
-        # All of the fingerprint: the copy of an object that changed in the middle only has another name.
-        key = hashlib.sha256(repr((self.bucket.url, id, fingerprint)).encode()).hexdigest()[:32]
-        return self.copies / key[:2] / f"{key}{PurePosixPath(id).suffix}"
-
-    def _hold(self, path: Path) -> IO[bytes] | None:
-        """Return the open copy, locked against eviction; None if it is not there."""
-        with contextlib.ExitStack() as undo, contextlib.suppress(OSError):  # evicted, before or just now
-            file = undo.enter_context(path.open("rb"))
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # a copy that another process locks is fetched again
-            if os.path.samestat(os.fstat(file.fileno()), path.stat()):
-                os.utime(path)
-                undo.pop_all()
-                return file
-        return None
-
-    def _get(self, id: str, fingerprint: str) -> IO[bytes]:
-        """Fetch a video, and return its copy, locked against eviction."""
-        try:
-            with self._locked_slot(_slot_number(id)) as slot:
-                held = self._hold(self._path(id, fingerprint)) if fingerprint else None  # another process was faster
-                return held or self._fetch(id, fingerprint, slot)
-        except OSError as error:
-            why = f"cannot be copied to {self.copies}: {error.strerror or error}"
-            raise VideoUnreadable(id, None, why) from error
-
-    @contextlib.contextmanager
-    def _locked_slot(self, number: int) -> Iterator[Path]:
-        """Lend a file to fetch into: the one of this number, or the next one if another process holds it.
-
-        Raises:
-            OSError: other processes hold all of them.
-        """
-        end, held = time.monotonic() + _SLOT_SECONDS, contextlib.ExitStack()
-        for other in range(_SLOTS):
-            slot = self.copies / PARTIAL / f"{(number + other) % _SLOTS:02}"
-            with contextlib.suppress(BlockingIOError):
-                held.enter_context(locked(slot.with_suffix(".lock"), end - time.monotonic()))
-                break
+        expected = is_expected(self, id)
+        if id.endswith("/"):
+            self._pack(id, slot)
         else:
-            raise BlockingIOError(errno.EAGAIN, f"other processes keep all {_SLOTS} of its slots; end them")
-        with held:
-            yield slot
-
-    def _fetch(self, id: str, fingerprint: str, slot: Path) -> IO[bytes]:
-        try:
-            make_private(slot)
-            is_expected = self._is_expected(id)
-            if id.endswith("/"):
-                self._pack(id, slot)
-            else:
-                self.bucket.fetch(id, slot)
-            slot.chmod(0o600)  # where the store's own tools put another file there
-            found = self._fingerprint(id, slot)
-            if fingerprint and not is_same_file(found, fingerprint):
-                why = f"changed in {self} since it was catalogued: {found} instead of {fingerprint}"
-                raise VideoChanged(id, None, why)
-            if id == self._expected[0] and not (is_expected and self._is_expected(id)):
-                self._check_content(id, slot, fingerprint)
-            path = self._path(id, fingerprint or found)
-            with slot.open("rb") as file:
-                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # the lock outlives renaming: no eviction in between
-                self._place(id, slot, path)
-                held = self._hold(path)
-            if held is None:
-                raise OSError("its copy was removed at once")
-            return held
-        finally:
-            slot.unlink(missing_ok=True)
+            self.bucket.fetch(id, slot)
+        slot.chmod(0o600)  # where the store's own tools put another file there
+        found = self._fingerprint(id, slot)
+        if fingerprint and not is_same_file(found, fingerprint):
+            why = f"changed in {self} since it was catalogued: {found} instead of {fingerprint}"
+            raise VideoChanged(id, None, why)
+        if id == self.expected[0] and not (expected and is_expected(self, id)):
+            self._check_content(id, slot, fingerprint)
+        return found
 
     def _pack(self, id: str, slot: Path) -> None:
         """Fetch a folder into one file, a ZIP archive without compression."""
@@ -555,25 +422,10 @@ class Copies(VideoSource):
         named.unlink(missing_ok=True)
         named.symlink_to(slot.name)
         try:
-            with open_pixels(named, kind_of(id)) as pixels:
+            with kind_of(id).open_pixels(named) as pixels:
                 check_content(named, content_of(pixels), fingerprint)
         finally:
             named.unlink()
-
-    def _place(self, id: str, slot: Path, path: Path) -> None:
-        """Give the fetched file its name. If space runs out, evict copies without a reader, least recently read first.
-
-        Raises:
-            VideoUnreadable: the copies that are being read leave too little space.
-        """
-        for wait in (_ROOM_SECONDS, _ROOM_SECONDS, 0.0):
-            if self._quota.add(slot, path, evicts=True):
-                return
-            time.sleep(wait)
-        why = (
-            f"its {slot.stat().st_size} bytes do not fit beside the {self._quota.used_bytes} bytes that are being read"
-        )
-        raise VideoUnreadable(id, None, f"{why}: raise --copies-gib")
 
 
 def open_source(name: str, options: SourceOptions) -> Copies | None:
@@ -588,15 +440,6 @@ def open_source(name: str, options: SourceOptions) -> Copies | None:
         raise UsageError(f"--copies-gib {options.copies_gib:g}: give more than 0, at most {MOST_GIB:g}")
     folder = Path(options.copies or cache_folder(options.cache_dir) / "copies").absolute()
     bucket, listed, (above, _, file) = Bucket(name), options.listed, name.rpartition("/")
-    if options.list_file is None and any(VideosKind(kind).form.id_of(file) == file != "" for kind in PIXEL_KINDS):
+    if options.list_file is None and any(kind.id_of(file) == file != "" for kind in KINDS.values()):
         bucket, listed = Bucket(above, file), lambda: (ListEntry(file),)
     return Copies(bucket, folder, int(options.copies_gib * (1 << 30)), listed)
-
-
-def _slot_number(id: str) -> int:
-    return int(hashlib.sha256(id.encode()).hexdigest(), 16)
-
-
-def _close(held: Mapping[tuple[str, str], IO[bytes]]) -> None:
-    for file in held.values():
-        file.close()

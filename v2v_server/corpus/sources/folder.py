@@ -15,24 +15,22 @@ from pathlib import Path, PurePosixPath
 from v2v_protocol.errors import CorpusError, VideoError
 from v2v_protocol.programs import printable
 from v2v_protocol.write_aside import OUTPUT_MARKER
+from v2v_server.corpus.sources.lists import LIST_SUFFIXES, ListEntry, count_left_out, read_list
+from v2v_server.corpus.sources.questions import answers
+from v2v_server.corpus.sources.sidecars import check_local, is_sidecar, local_state, sidecar_id, state_of_parts
 from v2v_server.corpus.sources.source import (
     GONE,
-    LIST_SUFFIXES,
     MANIFEST_NAME,
     UNPRINTABLE,
     FileState,
-    ListEntry,
     SourceOptions,
     VideoSource,
-    answers,
-    check_local,
-    count_left_out,
-    is_sidecar,
-    local_state,
-    read_list,
-    sidecar_id,
+    is_expected,
+    mark_of,
 )
-from v2v_server.store.pixels import VIDEOS, Pixels, VideosKind
+from v2v_server.kinds.kind import VideosKind
+from v2v_server.kinds.registry import VIDEOS
+from v2v_server.store.pixels import Pixels
 from v2v_server.store.verified import KnownState, Verified
 from v2v_server.video.fingerprint import check_fingerprint, files_in, unreadable
 
@@ -55,20 +53,20 @@ class Folder(VideoSource):
     """
 
     def __init__(self, root: Path, listed: Callable[[], tuple[ListEntry, ...] | None] = lambda: None) -> None:
-        super().__init__(str(root), listed)
+        super().__init__(str(root), listed, root)
+        self.folder: Path = root
         self._known: dict[str, KnownState] = {}
 
-    @property
-    def folder(self) -> Path:
-        """Return the folder that ids are relative to."""
-        return Path(self.name)
+    def path_of(self, id: str) -> str:
+        """Return the path of a video's file; that of a folder ends with a slash."""
+        return f"{self.name}/{id}"  # a Path takes longer to make than a file's state to be told
 
     def videos(self, refused: dict[str, str], left_out: Counter[str]) -> Iterator[str]:
         """List the videos, see :meth:`VideoSource.videos` and :func:`video_files`."""
         folders: set[str] = set()
         found = (
             video_files(self.folder, refused, left_out, self.kind)
-            if self.listed is None
+            if self.listed() is None
             else self._regular_files(refused)
         )
         for id in found:
@@ -82,14 +80,14 @@ class Folder(VideoSource):
         Raises:
             VideoUnreadable: the file is missing or cannot be read.
         """
-        path = f"{self.name}/{self.file_of(id)}"
+        path = self.path_of(id)
         try:
             if path.endswith("/"):
-                return self.state_of_parts(id, [(name, _numbers(status)) for name, status in files_in(path)])
+                return state_of_parts(self, id, [(name, _numbers(status)) for name, status in files_in(path)])
             size, modified, changed = _numbers(status := os.stat(path))
         except OSError as error:
             raise unreadable(id, error) from error
-        return (size, modified, changed ^ self.mark(id)) if stat.S_ISREG(status.st_mode) else GONE
+        return (size, modified, changed ^ mark_of(self, id)) if stat.S_ISREG(status.st_mode) else GONE
 
     def open_local(self, id: str, fingerprint: str) -> AbstractContextManager[Path]:
         """Lend the file; only a sidecar of one file is checked.
@@ -99,7 +97,7 @@ class Folder(VideoSource):
         """
         if fingerprint and is_sidecar(id) and not id.endswith("/"):
             check_local(self.folder / id, id, fingerprint)
-        return nullcontext(self.folder / (id if is_sidecar(id) else self.file_of(id)))
+        return nullcontext(self.folder / id if is_sidecar(id) else Path(self.path_of(id)))
 
     @contextmanager
     def open_pixels(self, id: str, fingerprint: str) -> Iterator[Pixels]:
@@ -107,8 +105,8 @@ class Folder(VideoSource):
         (:mod:`v2v_server.store.verified`).
         """
         with super().open_pixels(id, fingerprint) as pixels:
-            path = f"{self.name}/{self.file_of(id)}"
-            yield pixels if pixels.is_stored else Verified(pixels, path, self._known, partial(self._is_expected, id))
+            path, expected = self.path_of(id), partial(is_expected, self, id)
+            yield pixels if pixels.is_stored else Verified(pixels, path, self._known, expected)
 
     def has(self, files: Mapping[str, str]) -> bool:
         """Return whether no video has to be read whole first. One that cannot be read counts as well."""
@@ -164,7 +162,7 @@ class Folder(VideoSource):
         """
         if is_sidecar(id):
             check_local(self.folder / id, id, fingerprint, str(state or ""))
-        elif (path := self.folder / self.file_of(id)).is_dir():  # not as a worker has listed it
+        elif os.path.isdir(path := self.path_of(id)):  # not as a worker has listed it
             check_fingerprint(path, fingerprint)
         else:
             with super().open_pixels(id, fingerprint) as pixels:
@@ -186,7 +184,7 @@ class Folder(VideoSource):
             wanted = stat.S_IFDIR if id.endswith("/") else stat.S_IFREG
             return stat.S_IFMT(status.st_mode) == wanted and status.st_dev not in pseudo
 
-        for id, is_regular in answers(may_be_read, [entry.id for entry in self.listed or ()]):
+        for id, is_regular in answers(may_be_read, [entry.id for entry in self.listed() or ()]):
             if is_regular:
                 yield id
             else:
@@ -253,7 +251,7 @@ def locate(name: str, options: SourceOptions) -> tuple[Path, Callable[[], tuple[
     path = Path(name)
     if path.is_dir():
         root = path.resolve()
-        is_video = options.kind.has_parts and "/" in map(options.kind.form.id_of, os.listdir(root))
+        is_video = options.kind.has_parts and "/" in map(options.kind.id_of, os.listdir(root))
         if options.list_file is None and is_video:
             return root.parent, lambda: (ListEntry(f"{root.name}/"),)
         return root, options.listed
@@ -285,7 +283,7 @@ def video_files(
         left_out: counts, by suffix, files that may be videos of other endings; and, by path, folders of outputs.
         kind: what a video is; the id of a folder of pictures ends with a slash.
     """
-    id_of, pseudo, paths_of = kind.form.id_of, pseudo_devices(), Counter[tuple[int, int]]()
+    id_of, pseudo, paths_of = kind.id_of, pseudo_devices(), Counter[tuple[int, int]]()
 
     def below(folder: Path, prefix: str, above: frozenset[tuple[int, int]], links: int) -> Iterator[list[str]]:
         """Yield the videos below a folder, some at a time.

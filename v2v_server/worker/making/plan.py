@@ -11,14 +11,14 @@ import numpy.typing as npt
 from v2v_protocol.sample import SampleParams, needs_of
 from v2v_protocol.spec import MARGIN_PX, MOST_SUBSTEPS, StreamSpec
 from v2v_server.flow import FlowSettings
+from v2v_server.kinds.registry import kind_of
 from v2v_server.motion import cells_of
 from v2v_server.simulation.draw import choose_crop, draw
 from v2v_server.simulation.precision import Variant, variants
 from v2v_server.simulation.representations import NAMES
 from v2v_server.simulation.view import source_window
-from v2v_server.store.pixels import kind_of
 from v2v_server.video.decode import Cut
-from v2v_server.video.picture import MOST_BITS, ChromaCut
+from v2v_server.video.picture import ChromaCut
 from v2v_server.worker.job import ClipJob
 from v2v_server.worker.scene_choice import (
     CleanFrames,
@@ -97,13 +97,13 @@ def plan_sample(clip: ClipJob, index: int) -> SamplePlan:
     flow: FlowSettings | None = None
     still_px: int | None = 0
     flow_plan = None if scene is None else plan_flow(scene, frames, params, spec, picture, place)
-    is_rendered, needs = kind_of(clip.video) == "photographs", needs_of(clip.arrays)
-    if not is_rendered and needs.flow:
+    is_view, needs = kind_of(clip.video).is_view, needs_of(clip.arrays)
+    if not is_view and needs.flow:
         flow = FlowSettings.of(spec)
         if flow_plan is not None and flow_plan.still:
             flow = replace(flow, margin_px=0)
         still_px = flow.margin_px
-    has_motion = spec.substep_px > 0 and not is_rendered
+    has_motion = spec.substep_px > 0 and not is_view
     margin_px = max(still_px, MARGIN_PX) if has_motion and still_px is not None else still_px
     window, still = (source_window(params, recipe, picture, margin) for margin in (margin_px, still_px))
     chroma = chroma_cut(clip, params, frames, source) if needs.colour else None
@@ -129,8 +129,8 @@ def kernels_of(clip: ClipJob) -> frozenset[Variant]:
     others = [name for name in clip.arrays if name not in NAMES and needs_of([name]).events]
     found = frozenset[Variant]()
     for arrays in filter(None, (made, _LISTED if others else ())):
-        found |= _variants(clip.spec, clip.frames_per_second or 1.0, clip.thresholds, arrays, kind_of(clip.video))
-    return found
+        found |= _variants(clip.spec, clip.frames_per_second or 1.0, clip.thresholds, arrays)
+    return kind_of(clip.video).variants(found)
 
 
 @lru_cache(maxsize=64)
@@ -139,11 +139,7 @@ def _variants(
     frames_per_second: float,
     thresholds: tuple[float, float] | None,
     arrays: tuple[str, ...],
-    kind: str,
 ) -> frozenset[Variant]:
     step_seconds = spec.recipe.frame_stride / frames_per_second
     levels_per_step = MOST_SUBSTEPS - 1 if spec.substep_px else 0
-    found = variants(spec.recipe, spec.voxel_dtype, step_seconds, thresholds, arrays, levels_per_step)
-    if kind == "photographs":
-        found = frozenset(variant._replace(is_divided=False, bits=MOST_BITS, is_rendered=True) for variant in found)
-    return found
+    return variants(spec.recipe, spec.voxel_dtype, step_seconds, thresholds, arrays, levels_per_step)

@@ -10,7 +10,8 @@ from importlib.resources.abc import Traversable
 from v2v_protocol.errors import SidecarError, VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.sample import sidecar_endings
 from v2v_protocol.spec import StreamSpec
-from v2v_server.corpus.sources.source import VideoSource, open_sidecar, sidecar_id
+from v2v_server.corpus.sources.sidecars import open_sidecar, sidecar_id
+from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.store.cache import Cache, Cached
 from v2v_server.store.verified import read_unchanged
 from v2v_server.video.decode import ClipRequest, DecodedClip, SampleView
@@ -50,7 +51,7 @@ def decode_for(
             tuple((clip.seed, clip.epoch, index) for index in indices),
             tuple(SampleView(clip.spec, plan.params, clip.arrays) for plan in plans),
         )  # fmt: skip
-        source.expect(clip.video, clip.state)
+        source.expected = clip.video, clip.state
         with source.open_pixels(clip.video, clip.fingerprint) as pixels:
             if cache is not None and not pixels.is_stored:
                 pixels = Cached(pixels, cache, clip.video, clip.fingerprint)
