@@ -432,7 +432,8 @@ class Worker:
         if self._sidecars[0] != clip:
             try:
                 with open_sidecars(clip, self._source) as opened:
-                    read_ahead(clip, opened)
+                    if clip.sidecars:
+                        read_ahead(clip, opened)
                     self._sidecars = clip, opened
             except SidecarError as error:
                 self._sidecars = clip, error
