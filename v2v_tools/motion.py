@@ -26,7 +26,11 @@ from v2v_server.store.pixels import signal_of
 from v2v_server.system.compile_cache import cv2
 from v2v_server.video.decode import ClipRequest, Cut, DecodedClip
 from v2v_server.video.picture import SDR
-from v2v_server.worker.produce import Decoded, make_sample, plan_sample
+from v2v_server.video.rows import Rows
+from v2v_server.worker.job import ClipJob, SampleJob
+from v2v_server.worker.making.make import make_sample
+from v2v_server.worker.making.plan import plan_sample
+from v2v_server.worker.making.read import Decoded
 from v2v_tools.remake import RemadeSample, Remaker, lease_for
 
 LONGEST_SIDE_PX = 384
@@ -58,18 +62,18 @@ def quiet_voxels(made: RemadeSample, start: str = "") -> npt.NDArray[Any]:
     Returns:
         [lead voxels + T, bins, H, W], signed event counts.
     """
-    plan, lease = made.decoded.plan, made.lease
-    recipe = noise_free(plan.spec.recipe.replace(start=start or plan.spec.recipe.start))
-    spec = StreamSpec.from_dict({**plan.spec.to_dict(), "recipe": recipe})
-    lease = replace(lease, spec=spec.canonical(), spec_digest=spec.digest, arrays=("voxels",))
+    plan, clip = made.decoded.plan, made.job.clip
+    recipe = noise_free(clip.spec.recipe.replace(start=start or clip.spec.recipe.start))
+    spec = StreamSpec.from_dict({**clip.spec.to_dict(), "recipe": recipe})
+    job = replace(made.job, clip=replace(clip, spec=spec, arrays=("voxels",)))
     params = replace(
         plan.params,
         noise_sigma=0.0,
         hot_pixel_count=0,
         effects={name: value for name, value in plan.params.effects.items() if name not in _NOISE},
     )
-    quiet = Decoded(replace(plan, spec=spec, params=params, flow=None), made.decoded.clip)
-    return make_sample(lease, quiet).arrays["voxels"]
+    quiet = Decoded(replace(plan, params=params, flow=None), made.decoded.clip)
+    return make_sample(job, quiet).arrays["voxels"]
 
 
 def start_events(made: RemadeSample) -> npt.NDArray[np.float64]:
@@ -87,7 +91,7 @@ def measured_motion(made: RemadeSample) -> MeasuredMotion:
     """Measure what moves in the frames of a sample; nothing where they are rendered."""
     if made.decoded.clip.is_view:
         return MeasuredMotion()
-    plan, recipe = made.decoded.plan, made.decoded.plan.spec.recipe
+    plan, recipe = made.decoded.plan, made.job.clip.spec.recipe
     frames = eight_bits(made.decoded.clip.frames, made.decoded.clip.signal)
     return measure(apply_view(without_margin(frames, plan.params, recipe, plan.margin_px), plan.params, recipe))
 
@@ -179,8 +183,9 @@ class WholePictures:
         lease = lease_for(
             Request(b"", 0, 0), sequence=sequence, catalogue=catalogue, spec=spec, seed=0, arrays=("voxels", "frames")
         )
-        lease = replace(lease, rows="full", height_px=height, width_px=width, thresholds=())
-        plan = plan_sample(lease, 0)
+        job = SampleJob.of(lease)
+        job = replace(job, clip=replace(job.clip, rows=Rows(), height_px=height, width_px=width, thresholds=None))
+        plan = plan_sample(job.clip, 0)
         frames = np.empty((len(plan.source), height, width), np.uint8)
         index, stride = catalogue.frame_index(video.id), recipe.frame_stride
         count = (len(frames) - 1) * stride + 1
@@ -192,7 +197,7 @@ class WholePictures:
                 cv2.resize(picture.grey, (width, height), frame, interpolation=cv2.INTER_AREA)
         seconds = index.seconds(sequence.start_frame, count)[::stride]
         clip = DecodedClip(frames, seconds, codec="", bit_exact=False, signal=signal)
-        sample = make_sample(lease, Decoded(plan, clip))
+        sample = make_sample(job, Decoded(plan, clip))
         camera = Camera.of(sample.arrays, sample.provenance, f"threshold {THRESHOLD:g}, no noise", recipe)
         return replace(camera, step_seconds=stride / video.frames_per_second)
 
@@ -207,7 +212,7 @@ class WholePictures:
             Request(b"", 0, 0), sequence=sequence, catalogue=self._catalogue, spec=self._stream, seed=seed,
             arrays=("voxels",),
         )  # fmt: skip
-        plan = plan_sample(replace(lease, thresholds=()), 0)
+        plan = plan_sample(replace(ClipJob.of(lease), thresholds=None), 0)
         params = plan.params
         left, top = params.crop_left_px / params.scale, params.crop_top_px / params.scale
         width, height = recipe.crop_width_px / params.scale, recipe.crop_height_px / params.scale

@@ -20,14 +20,16 @@ from v2v_server.quarantine import Quarantine
 from v2v_server.schedule import MOST_CANDIDATES, Schedule, SequenceTable, VideoSequence
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
-from v2v_server.worker.produce import Decoded, decode_for, list_sample_events, make_sample, open_sidecars
+from v2v_server.worker.job import SampleJob
+from v2v_server.worker.making.make import list_sample_events, make_sample
+from v2v_server.worker.making.read import Decoded, decode_for, open_sidecars
 
 
 @dataclass(frozen=True, slots=True)
 class RemadeSample:
-    """A sample, the lease it was made for, and the frames it was made of."""
+    """A sample, its job, and the frames it was made of."""
 
-    lease: Lease
+    job: SampleJob
     decoded: Decoded
     sample: Sample
 
@@ -78,7 +80,7 @@ class Remaker:
     def events(self, seed: int, epoch: int, index: int) -> EventList:
         """List the events of a sample with the times of their crossings. Errors: :meth:`made`."""
         remade = self.made(seed, epoch, index)
-        return list_sample_events(remade.lease, remade.decoded)
+        return list_sample_events(remade.job.clip, remade.decoded)
 
     def made(self, seed: int, epoch: int, index: int) -> RemadeSample:
         """Make the sample of this name, and return what it was made of too.
@@ -107,14 +109,15 @@ class Remaker:
             lease = lease_for(
                 request, sequence=sequence, catalogue=catalogue, spec=spec, seed=seed, arrays=self._arrays
             )
+            job = SampleJob.of(lease)
             try:
-                decoded = decode_for(lease, lease.indices, catalogue.source)[0]
-                with open_sidecars(lease, catalogue.source) as sidecars:
-                    return RemadeSample(lease, decoded, make_sample(lease, decoded, sidecars=sidecars))
+                decoded = decode_for(job.clip, lease.indices, catalogue.source)[0]
+                with open_sidecars(job.clip, catalogue.source) as sidecars:
+                    return RemadeSample(job, decoded, make_sample(job, decoded, sidecars=sidecars))
             except VideoError as error:
-                if isinstance(error, VideoUnreadable) and not _is_left_out(catalogue, lease.video):
+                if isinstance(error, VideoUnreadable) and not _is_left_out(catalogue, video.id):
                     raise
-                request = next_candidate(request, Refusal(lease.video, error.frame, error.reason))
+                request = next_candidate(request, Refusal(video.id, error.frame, error.reason))
         refusals = "; ".join(dict.fromkeys(map(str, request.refusals)))
         raise SampleUnavailable("unavailable", f"sample {index} of epoch {epoch}: {refusals}")
 

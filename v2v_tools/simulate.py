@@ -23,7 +23,7 @@ from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.config import ServeConfig
 from v2v_server.kinds.registry import KindFlags, kind_from
 from v2v_server.quarantine import Quarantine, quarantine_path, read_quarantine
-from v2v_server.worker.produce import list_sample_events
+from v2v_server.worker.making.make import list_sample_events
 from v2v_tools.event_files import EVENT_WRITERS, check_event_file, write_events
 from v2v_tools.remake import Remaker, open_shown
 
@@ -105,7 +105,7 @@ def _run(asked: argparse.Namespace) -> None:
             camera = Camera.of(sample.arrays, provenance, f"index {asked.index}", spec.recipe)
             write_png(asked.picture, draw_sheet([camera], f"seed {asked.seed}, epoch {asked.epoch}", moments=_MOMENTS))
         if asked.events is not None:
-            events = list_sample_events(remade.lease, remade.decoded)
+            events = list_sample_events(remade.job.clip, remade.decoded)
             write_events(asked.events, events)
             show(f"{len(events)} events written to {asked.events}")
     except OSError as error:

@@ -44,10 +44,10 @@ _COLUMNS: tuple[Column, ...] = (
 
 def patches_of(made: RemadeSample) -> int:
     """Return how many patches a sample of a photograph has."""
-    lease, plan = made.lease, made.decoded.plan
-    size = lease.height_px, lease.width_px
-    names = {"seed": lease.seed, "epoch": lease.epoch, "index": lease.indices[0]}
-    world = draw_world(plan.spec.recipe, plan.params, **names, picture_px=size, seconds=(0.0, 1.0))
+    clip, params = made.job.clip, made.decoded.plan.params
+    size = clip.height_px, clip.width_px
+    names = {"seed": clip.seed, "epoch": clip.epoch, "index": made.job.index}
+    world = draw_world(clip.spec.recipe, params, **names, picture_px=size, seconds=(0.0, 1.0))
     return len(world.layers) - 1
 
 

@@ -29,7 +29,9 @@ from v2v_server.prepare import prepare
 from v2v_server.schedule import Schedule, SequenceTable
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.video.rows import Rows
-from v2v_server.worker.produce import decode_for, make_sample, open_sidecars
+from v2v_server.worker.job import SampleJob
+from v2v_server.worker.making.make import make_sample
+from v2v_server.worker.making.read import decode_for, open_sidecars
 from v2v_tools.remake import lease_for
 
 ROWS = Rows.parse("0.05:0.95")
@@ -260,10 +262,11 @@ def samples_of(catalogue: Catalogue, row: Row, cache: Cache | None = None) -> li
             Request(b"", row.epoch, index), sequence=sequence, catalogue=catalogue, spec=spec, seed=row.seed,
             arrays=row.arrays, siblings=siblings,
         )  # fmt: skip
-        all_decoded = decode_for(lease, lease.indices, catalogue.source, cache)
-        with open_sidecars(lease, catalogue.source) as sidecars:
+        job = SampleJob.of(lease)
+        all_decoded = decode_for(job.clip, lease.indices, catalogue.source, cache)
+        with open_sidecars(job.clip, catalogue.source) as sidecars:
             for which, decoded in zip(lease.indices, all_decoded, strict=True):
-                samples[which] = make_sample(replace(lease, indices=(which,)), decoded, sidecars=sidecars)
+                samples[which] = make_sample(replace(job, index=which), decoded, sidecars=sidecars)
     return [samples[index] for index in range(row.count)]
 
 

@@ -43,11 +43,12 @@ from v2v_protocol.arena import (
     find_memory,
     open_memory,
 )
-from v2v_protocol.errors import ProtocolError, SidecarError, UsageError, VideoChanged, VideoError, VideoUnreadable
+from v2v_protocol.errors import ProtocolError, SidecarError, UsageError, VideoError
 from v2v_protocol.keys import key_for, leaves_host
 from v2v_protocol.link.dealer import Dealer
 from v2v_protocol.messages import Buffer, Frames, Lease, Notes, Result, WorkerHello, encode_sample
 from v2v_protocol.sample import Form, Layout, new_arrays
+from v2v_server.corpus.sources.sidecars import sidecar_id
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.lease_memory import LARGEST_MEMORY_BYTES
 from v2v_server.simulation.precision import USUAL
@@ -65,6 +66,7 @@ from v2v_server.system.process import (
     take_long_turns,
 )
 from v2v_server.system.sandbox import confine
+from v2v_server.worker.arrays.boxes import read_ahead
 from v2v_server.worker.conversation import (
     CREDIT,
     Inspect,
@@ -79,17 +81,11 @@ from v2v_server.worker.conversation import (
     WorkerAction,
     WorkerConversation,
 )
+from v2v_server.worker.job import ClipJob, SampleJob
 from v2v_server.worker.logbook import IDLE, note, take_arena
-from v2v_server.worker.produce import (
-    Decoded,
-    decode_for,
-    kernels_of,
-    make_sample,
-    open_sidecars,
-    read_ahead,
-    sample_layout,
-    sidecar_files,
-)
+from v2v_server.worker.making.make import make_sample
+from v2v_server.worker.making.plan import kernels_of
+from v2v_server.worker.making.read import Clips, open_sidecars
 from v2v_server.worker.warm_up import is_compiled, load_in_turn, warm_up_in_turn
 
 Find: TypeAlias = Callable[[ArenaName, bool], int]
@@ -252,66 +248,6 @@ def _map(descriptor: int, offset: int, size: int) -> npt.NDArray[np.uint8]:
     return np.frombuffer(mapping, np.uint8, size, offset - begin)
 
 
-class Clips:
-    """Decode clips for leases, together with those of their siblings.
-
-    Args:
-        source: where the videos come from.
-        cache: cache of decoded pieces for later epochs; None stores nothing.
-    """
-
-    def __init__(self, source: VideoSource, cache: Cache | None = None) -> None:
-        self._source = source
-        self._cache = cache
-        self._kept: dict[tuple[object, ...], Decoded] = {}
-
-    def take(self, lease: Lease) -> tuple[Decoded, bool]:
-        """Return the decoded clip of the lease's sample, and whether it was decoded just now.
-
-        Raises:
-            VideoError, ProtocolError: see :func:`v2v_server.worker.produce.decode_for`.
-        """
-        kept = self._kept.pop(_key(lease, lease.indices[0]), None)
-        if kept is not None:
-            return kept, False
-        self._kept = {}  # siblings that never came
-        if len(lease.indices) > 1:
-            try:
-                first, *others = decode_for(lease, lease.indices, self._source, self._cache)
-            except VideoError:
-                pass  # a sibling may need more of the clip than this sample; try without siblings
-            else:
-                self._kept = {_key(lease, index): one for index, one in zip(lease.indices[1:], others, strict=True)}
-                return first, True
-        try:
-            return decode_for(lease, lease.indices[:1], self._source, self._cache)[0], True
-        except (VideoChanged, VideoUnreadable):
-            raise
-        except VideoError:
-            # A decoder may hide a temporary storage error, so try once more. An error of the file repeats.
-            return decode_for(lease, lease.indices[:1], self._source, self._cache)[0], True
-
-    def said_of_cache(self, decoded: Decoded) -> str:
-        """Return the cache field of a sample's header, see :class:`v2v_protocol.messages.SampleHeader`."""
-        if self._cache is None or decoded.clip.origin == "store":
-            return ""
-        if decoded.clip.origin == "cache":
-            return "hit"
-        return f"miss: {self._cache.trouble}" if self._cache.trouble else "miss"
-
-    def has(self, lease: Lease) -> bool:
-        """Return whether the lease's sample needs no decoding."""
-        return _key(lease, lease.indices[0]) in self._kept
-
-
-def _key(lease: Lease, index: int) -> tuple[object, ...]:
-    """Return the fields of a lease that its decoded clip depends on, and its index."""
-    return (
-        lease.spec, lease.seed, lease.epoch, index, lease.arrays, lease.video, lease.fingerprint, lease.rows,
-        lease.start_frame, lease.thresholds,
-    )  # fmt: skip
-
-
 class Worker:
     """One worker: a socket, kernels and clips, and the conversation that decides what to do with them.
 
@@ -360,7 +296,7 @@ class Worker:
         if cache is not None:
             cache.on_wait = self._note_wait
         self._source = source
-        self._sidecars: tuple[object, dict[str, Traversable | None] | SidecarError] = None, {}  # of the last lease
+        self._sidecars: tuple[ClipJob | None, dict[str, Traversable | None] | SidecarError] = None, {}  # the last ones
         self._unfetched: tuple[dict[str, str], VideoError] | None = None  # the last files that could not be fetched
         self._is_remote = leaves_host(address)
         self._kernels = set(USUAL)  # loaded kernels
@@ -428,16 +364,17 @@ class Worker:
                 messages = self._messages(seconds)
                 return conversation.on_messages(messages, time.monotonic())
             case Inspect(lease):
-                return conversation.on_inspected(self._inspect(lease), time.monotonic())
+                return conversation.on_inspected(self._inspect(ClipJob.of(lease), lease.indices[0]), time.monotonic())
             case Load(lease):
-                for variant in kernels_of(lease) - self._kernels:
+                clip = ClipJob.of(lease)
+                for variant in kernels_of(clip) - self._kernels:
                     load_in_turn(variant)
                     self._kernels.add(variant)
-                self._fetch(lease)
-                self._open_sidecars(lease)
+                self._fetch(clip, lease.indices[0])
+                self._open_sidecars(clip)
                 return conversation.on_kernels_loaded(time.monotonic())
             case Make(lease):
-                if not self._clips.has(lease):
+                if not self._clips.has(ClipJob.of(lease), lease.indices[0]):
                     give_way()  # processor caches are cold before a new clip, but warm within one
                 limit_processor_time(LONGEST_LEASE_SECONDS)
                 self._at = lease.lease
@@ -457,49 +394,49 @@ class Worker:
             case _:
                 return []
 
-    def _inspect(self, lease: Lease) -> Readiness:
-        """Return what the work on a lease needs."""
-        missing, has_video = kernels_of(lease) - self._kernels, self._has_video(lease)
-        has_sidecars = not sidecar_files(lease) or self._sidecars[0] == _clip(lease)
-        is_ready = not missing and has_video and has_sidecars
-        is_small = has_video or _size_bytes(lease) <= _SOON_FETCHED_BYTES
-        return Readiness(is_ready, is_small and all(map(is_compiled, missing)), self._clips.has(lease))
+    def _inspect(self, clip: ClipJob, index: int) -> Readiness:
+        """Return what the work on a sample of a clip needs."""
+        missing, has_video = kernels_of(clip) - self._kernels, self._has_video(clip, index)
+        is_ready = not missing and has_video and (not clip.sidecars or self._sidecars[0] == clip)
+        is_small = has_video or _size_bytes(clip) <= _SOON_FETCHED_BYTES
+        return Readiness(is_ready, is_small and all(map(is_compiled, missing)), self._clips.has(clip, index))
 
     def _note_wait(self, waits: bool) -> None:
         """Exclude a wait for other processes from the decoding time."""
         note(self._logbook, self._at, decodes=not waits)
 
-    def _has_video(self, lease: Lease) -> bool:
-        """Return whether work on the lease can begin: its video is on this host, or fetching it has failed, which is
+    def _has_video(self, clip: ClipJob, index: int) -> bool:
+        """Return whether work on a sample can begin: its video is on this host, or fetching it has failed, which is
         reported.
         """
-        if self._clips.has(lease):
+        if self._clips.has(clip, index):
             return True
-        files = _files(lease)
-        self._source.expected = lease.video, lease.notes.state
+        files = _files(clip)
+        self._source.expected = clip.video, clip.state
         return (self._unfetched is not None and self._unfetched[0] == files) or self._source.has(files)
 
-    def _fetch(self, lease: Lease) -> None:
-        """Fetch the lease's files before the lease is begun, so that network time does not count against the sample."""
-        if self._has_video(lease):
+    def _fetch(self, clip: ClipJob, index: int) -> None:
+        """Fetch a sample's files before its lease is begun, so that network time does not count against the sample."""
+        if self._has_video(clip, index):
             return
-        files = _files(lease)
+        files = _files(clip)
         try:
             self._source.fetch(files)
         except VideoError as error:
             self._unfetched = files, error
 
-    def _open_sidecars(self, lease: Lease) -> dict[str, Traversable | None] | SidecarError:
-        """Read the lease's sidecars before the lease is begun, so that their time does not count against the sample.
+    def _open_sidecars(self, clip: ClipJob) -> dict[str, Traversable | None] | SidecarError:
+        """Read a clip's sidecars before its lease is begun, so that their time does not count against the sample.
         Siblings use them too; the next clip checks them again.
         """
-        if self._sidecars[0] != _clip(lease):
+        if self._sidecars[0] != clip:
             try:
-                with open_sidecars(lease, self._source) as opened:
-                    read_ahead(lease, opened)
-                    self._sidecars = _clip(lease), opened
+                with open_sidecars(clip, self._source) as opened:
+                    if clip.sidecars:
+                        read_ahead(clip, opened)
+                    self._sidecars = clip, opened
             except SidecarError as error:
-                self._sidecars = _clip(lease), error
+                self._sidecars = clip, error
         return self._sidecars[1]
 
     def _messages(self, wait_seconds: float) -> list[bytes]:
@@ -523,26 +460,27 @@ class Worker:
         Raises:
             VideoError, SidecarError: its video, or a file beside it, cannot be used.
         """
-        if self._unfetched is not None and self._unfetched[0] == _files(lease):
+        job = SampleJob.of(lease)
+        if self._unfetched is not None and self._unfetched[0] == _files(job.clip):
             error, self._unfetched = self._unfetched[1], None
             if error.video == lease.video:
                 raise error  # otherwise opening the sidecar reports it
         began = time.monotonic()
-        buffer = open_output_buffer(lease, sample_layout(lease), self._find)
+        buffer = open_output_buffer(lease, job.clip.layout, self._find)
         has_room = time.monotonic()
         started = time.process_time()
-        clip, decoded = self._clips.take(lease)
+        decoded, is_new = self._clips.take(job.clip, lease.indices)
         note(self._logbook, lease.lease)
-        if decoded and not clip.clip.origin:
+        if is_new and not decoded.clip.origin:
             # PyAV creates a reference cycle for a frame whose side data (its orientation) was read. Python's collector
             # counts few objects and waits, but each of them holds pictures.
             gc.collect()
         has_clip = time.monotonic()
-        sidecars = self._open_sidecars(lease)
+        sidecars = self._open_sidecars(job.clip)
         if isinstance(sidecars, SidecarError):
             self._sidecars = None, {}  # the next lease tries again
             raise sidecars
-        sample = make_sample(lease, clip, buffer.arrays, sidecars)
+        sample = make_sample(job, decoded, buffer.arrays, sidecars)
         has_sample = time.monotonic()
         frames = sample_message(
             lease,
@@ -550,8 +488,8 @@ class Worker:
             provenance=sample.provenance.to_dict(),
             worker=self._name,
             cpu_seconds=time.process_time() - started,
-            decoded=decoded,
-            cache=self._clips.said_of_cache(clip) if decoded else "",
+            decoded=is_new,
+            cache=self._clips.said_of_cache(decoded) if is_new else "",
             packed=self._is_remote,
         )
         work = Result(
@@ -586,20 +524,16 @@ def unshared_name(beginning: str | None) -> str:
     return f"{beginning or f'{socket.gethostname()}-{os.getpid()}'}-{secrets.token_hex(4)}"
 
 
-def _size_bytes(lease: Lease) -> int:
-    """Return the size of the lease's video, which starts the fingerprint."""
-    size = lease.fingerprint.partition("-")[0]
+def _size_bytes(clip: ClipJob) -> int:
+    """Return the size of a clip's video, which starts the fingerprint."""
+    size = clip.fingerprint.partition("-")[0]
     return int(size) if size.isdecimal() else 0
 
 
-def _clip(lease: Lease) -> object:
-    """Return what a lease's sidecars are read for: equal for siblings."""
-    return lease.video, lease.arrays, lease.sidecars, lease.seed, lease.epoch, lease.start_frame
-
-
-def _files(lease: Lease) -> dict[str, str]:
-    """Return the fingerprints of the files that a lease's sample is made from, by id."""
-    return {lease.video: lease.fingerprint, **dict(sidecar_files(lease).values())}
+def _files(clip: ClipJob) -> dict[str, str]:
+    """Return the fingerprints of the files that a clip's samples are made from, by id."""
+    beside = {sidecar_id(clip.video, ending): sidecar.fingerprint for ending, sidecar in clip.sidecars.items()}
+    return {clip.video: clip.fingerprint, **beside}
 
 
 def run_worker(

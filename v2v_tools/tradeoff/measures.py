@@ -36,7 +36,10 @@ from v2v_server.corpus.sources.folder import Folder
 from v2v_server.schedule import Schedule, SequenceTable
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.worker.arrays.context import SampleContext
-from v2v_server.worker.produce import decode_for, make_sample, plan_sample, sample_context
+from v2v_server.worker.job import ClipJob, SampleJob
+from v2v_server.worker.making.make import make_sample, sample_context
+from v2v_server.worker.making.plan import plan_sample
+from v2v_server.worker.making.read import decode_for
 from v2v_tools.remake import lease_for
 from v2v_tools.tradeoff.report import THRESHOLDS
 from v2v_tools.tradeoff.settings import ServeSetting
@@ -79,8 +82,9 @@ def leases_of(setting: ServeSetting, clips: Catalogue) -> Leases:
 def seen(leases: Leases, number: int, views: int = 1) -> list[SampleContext]:
     """Return the first views of a lease before simulation, without hot pixels, from one decode."""
     lease, contexts = leases.each[number], []
-    for decoded in decode_for(lease, lease.indices[:views], Folder(leases.root)):
-        context, _ = sample_context(lease, decoded, Needs(events=True))
+    clip = ClipJob.of(lease)
+    for decoded in decode_for(clip, lease.indices[:views], Folder(leases.root)):
+        context, _ = sample_context(clip, decoded, Needs(events=True))
         params = dataclasses.replace(context.params, hot_pixel_count=0)
         contexts.append(dataclasses.replace(context, params=params))
     return contexts
@@ -117,7 +121,7 @@ def accuracy(model: Leases, others: Mapping[str, Leases]) -> dict[str, npt.NDArr
     """
     sums = {name: np.zeros((len(THRESHOLDS), 3)) for name in (*others, NOISE_ROW, DRAW_ROW)}
     for number, lease in enumerate(model.each):
-        (exact,), drawn = seen(model, number), plan_sample(lease, lease.indices[1]).params
+        (exact,), drawn = seen(model, number), plan_sample(ClipJob.of(lease), lease.indices[1]).params
         contexts = {name: seen(other, number)[0] for name, other in others.items()}
         for row, threshold in enumerate(np.array(THRESHOLDS, np.float32).tolist()):
             camera = dataclasses.replace(exact.params, threshold_pos=threshold, threshold_neg=threshold)
@@ -159,10 +163,11 @@ def making(leases: Leases, samples_per_decode: int) -> Callable[[int], None]:
 
     def make(number: int) -> None:
         lease = leases.each[number % len(leases.each)]
+        job = SampleJob.of(lease)
         for first in range(0, _VIEWS, samples_per_decode):
             indices = lease.indices[first : first + samples_per_decode]
-            for index, decoded in zip(indices, decode_for(lease, indices, Folder(leases.root)), strict=True):
-                make_sample(dataclasses.replace(lease, indices=(index,)), decoded)
+            for index, decoded in zip(indices, decode_for(job.clip, indices, Folder(leases.root)), strict=True):
+                make_sample(dataclasses.replace(job, index=index), decoded)
 
     return make
 

@@ -36,8 +36,9 @@ from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.photograph import kept_photographs
 from v2v_server.store.picture_sequence import PictureSequence
 from v2v_server.store.video_file import VideoFile
-from v2v_server.worker.process import Clips
-from v2v_server.worker.produce import make_sample
+from v2v_server.worker.job import ClipJob, SampleJob
+from v2v_server.worker.making.make import make_sample
+from v2v_server.worker.making.read import Clips
 from v2v_tools.remake import lease_for
 
 FRAMES, CHANGED = 126, 60
@@ -113,7 +114,8 @@ def made(leases: list[Lease], clips: Clips) -> list[bytes | None]:
     found: list[bytes | None] = []
     for lease in leases:
         try:
-            sample = make_sample(lease, clips.take(lease)[0])
+            job = SampleJob.of(lease)
+            sample = make_sample(job, clips.take(job.clip, lease.indices)[0])
             found.append(b"".join(array.tobytes() for array in sample.arrays.values()))
         except VideoChanged:
             found.append(None)
@@ -214,7 +216,7 @@ def test_what_changes_during_a_read_is_read_again(
         corpus.restore()
         left[0] = 100
         with pytest.raises(VideoUnreadable, match="changes while it is read"):
-            Clips(Folder(corpus.root)).take(affected)
+            Clips(Folder(corpus.root)).take(ClipJob.of(affected), affected.indices)
 
 
 def touched(path: Path) -> None:

@@ -18,6 +18,7 @@ import zmq
 
 from tests.oracles.dealers import wait
 from tests.protocol.persisted_values import example
+from tests.server.named_corpus import SMALL_SPEC
 from v2v_protocol import PROTOCOL_VERSION
 from v2v_protocol.errors import (
     RemoteError,
@@ -45,7 +46,7 @@ from v2v_protocol.messages import (
     decode,
     encode,
 )
-from v2v_protocol.sample import Layout, new_arrays
+from v2v_protocol.sample import new_arrays
 from v2v_server.commands.worker import main as worker_command
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.simulation.precision import Variant
@@ -64,9 +65,14 @@ from v2v_server.worker.conversation import (
     WorkerAction,
     WorkerConversation,
 )
-from v2v_server.worker.process import Clips, OutputBuffer, Worker, run_worker
+from v2v_server.worker.job import ClipJob, SampleJob
+from v2v_server.worker.making.read import Clips
+from v2v_server.worker.process import OutputBuffer, Worker, run_worker
 
-LEASE: Lease = replace(example(Lease), indices=(3,), arena="", slot=0)
+LEASE: Lease = replace(
+    example(Lease), indices=(3,), arena="", slot=0, spec=SMALL_SPEC.canonical(), rows="full", arrays=("frames",),
+    refusals={"refusals": []}, height_px=16, width_px=24, frames_per_second=25.0, thresholds=(),
+)  # fmt: skip
 HELLO = WorkerHello("w", 1, 2)
 IN_SLOT: Frames = [b"header"]
 IN_MESSAGE: Frames = [b"header", b"array"]
@@ -337,7 +343,6 @@ class TestSiblings:
 # --- the process ------------------------------------------------------------------------------------------------------
 
 WAIT_MS = 60_000
-LAYOUT: Layout = {"voxels": ("int8", (2, 2))}
 VARIANT = Variant("int16", True, "float32")
 
 
@@ -360,37 +365,14 @@ class Server:
             self._router.send_multipart([self.worker, *encode(message)])
 
 
-@pytest.fixture
-def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Server]:
-    """Samples in slots. Lease 2 needs no decoding, lease 3 fails, lease 4 needs a kernel that is not loaded."""
-
-    def make(lease: Lease, *_: object) -> Any:
-        at.did.append(f"make {lease.lease}")
-        if lease.lease == 3:
-            raise VideoError("a.mp4", 7, "cut short")
-        return SimpleNamespace(provenance=SimpleNamespace(to_dict=dict))
-
-    with zmq.Context() as context, context.socket(zmq.ROUTER) as router, (tmp_path / "logbook").open("wb") as logbook:
+@contextmanager
+def working(folder: Path) -> Iterator[Server]:
+    """Lend a server whose worker has said hello and runs in a thread."""
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as router, (folder / "logbook").open("wb") as logbook:
         router.setsockopt(zmq.LINGER, 0)
         at = Server(router)
         port = router.bind_to_random_port("tcp://127.0.0.1")
-        worker = Worker("w", Folder(tmp_path), f"tcp://127.0.0.1:{port}", logbook.fileno())
-        monkeypatch.setattr(worker_module, "make_sample", make)
-        monkeypatch.setattr(worker_module, "sample_layout", lambda lease: LAYOUT)
-        monkeypatch.setattr(
-            worker_module,
-            "open_output_buffer",
-            lambda lease, layout, arenas: OutputBuffer(new_arrays(layout), in_slot=True),
-        )
-        monkeypatch.setattr(worker_module, "kernels_of", lambda lease: frozenset({VARIANT} if lease.lease > 3 else ()))
-        monkeypatch.setattr(worker_module, "is_compiled", lambda variant: True)
-        monkeypatch.setattr(worker_module, "load_in_turn", lambda variant: at.did.append("load"))
-        monkeypatch.setattr(worker_module, "give_way", lambda: at.did.append("give way"))
-        monkeypatch.setattr(
-            worker_module, "note", lambda _, lease, decodes=False: decodes or at.did.append(f"note {lease}")
-        )
-        monkeypatch.setattr(Clips, "take", lambda self, lease: (None, False))
-        monkeypatch.setattr(Clips, "has", lambda self, lease: lease.lease == 2)
+        worker = Worker("w", Folder(folder), f"tcp://127.0.0.1:{port}", logbook.fileno())
         thread = threading.Thread(target=worker.run)
         thread.start()
         try:
@@ -404,9 +386,53 @@ def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Server]:
             assert not thread.is_alive()
 
 
+@pytest.fixture
+def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Server]:
+    """Samples in slots, whose indices are the numbers of their leases. Lease 2 needs no decoding, lease 3 fails, and
+    lease 4 needs a kernel that is not loaded.
+    """
+
+    def make(job: SampleJob, *_: object) -> Any:
+        at.did.append(f"make {job.index}")
+        if job.index == 3:
+            raise VideoError("a.mp4", 7, "cut short")
+        return SimpleNamespace(provenance=SimpleNamespace(to_dict=dict))
+
+    for name, replaced in {
+        "make_sample": make,
+        "open_output_buffer": lambda lease, layout, arenas: OutputBuffer(new_arrays(layout), in_slot=True),
+        "kernels_of": lambda clip: frozenset({VARIANT} if clip.start_frame == 4 else ()),
+        "is_compiled": lambda variant: True,
+        "load_in_turn": lambda variant: at.did.append("load"),
+        "give_way": lambda: at.did.append("give way"),
+        "note": lambda _, lease, decodes=False: decodes or at.did.append(f"note {lease}"),
+    }.items():
+        monkeypatch.setattr(worker_module, name, replaced)
+    monkeypatch.setattr(Clips, "take", lambda self, clip, indices: (None, False))
+    monkeypatch.setattr(Clips, "has", lambda self, clip, index: index == 2)
+    with working(tmp_path) as at:
+        yield at
+
+
+@pytest.mark.parametrize("damaged", ["frame_index", "scene"])
+def test_a_lease_with_a_damaged_part_fails_and_its_worker_goes_on(tmp_path: Path, damaged: str) -> None:
+    """The server passes on what its index on disk holds. Three deaths over it would cost the video all its readers."""
+    spec = replace(SMALL_SPEC, scene="auto" if damaged == "scene" else "off")
+    lease = replace(LEASE, video="a.mp4", spec=spec.canonical(), **{damaged: b"garbage"})  # type: ignore[arg-type]
+    with working(tmp_path) as server:
+        for number in (1, 2):
+            server.says(replace(lease, lease=number))
+            assert server.heard() == Begun(number)
+            failed = server.heard()
+            assert isinstance(failed, LeaseFailed)
+            assert (failed.lease, failed.here) == (number, False)
+            what = {"frame_index": "index", "scene": "scene"}[damaged]
+            assert failed.reason.startswith(f"its {what} from the server is damaged: {damaged.replace('_', ' ')} ")
+
+
 def test_it_makes_what_it_is_given_and_notes_what_it_is_at(server: Server) -> None:
     """Siblings are made in one turn on the core."""
-    server.says(*(replace(LEASE, lease=number) for number in range(1, 5)))
+    server.says(*(replace(LEASE, lease=number, indices=(number,), start_frame=number) for number in range(1, 5)))
     said = [server.heard()]
     while not isinstance(said[-1], Result) or said[-1].lease != 4:
         said.append(server.heard())
@@ -428,19 +454,25 @@ def test_sidecars_are_read_before_their_lease_begins(server: Server, monkeypatch
     """The time and memory that labels take count against no sample: nothing has begun, and the logbook says so."""
 
     @contextmanager
-    def opened(lease: Lease, source: object) -> Iterator[dict[str, None]]:
-        server.did.append(f"open {lease.lease}")
-        if lease.lease == 5:
+    def opened(clip: ClipJob, source: object) -> Iterator[dict[str, None]]:
+        server.did.append(f"open from {clip.start_frame}")
+        if clip.start_frame == 18:
             raise SidecarError("a.mp4", ".boxes/", "is gone", here=True)
         yield {}
 
     monkeypatch.setattr(worker_module, "open_sidecars", opened)
-    monkeypatch.setattr(worker_module, "kernels_of", lambda lease: frozenset())
+    monkeypatch.setattr(worker_module, "kernels_of", lambda clip: frozenset())
     labelled = replace(LEASE, video="a.mp4", arrays=("boxes",))
     starts = {1: 0, 2: 0, 4: 9, 5: 18}
     server.says(
         *(
-            replace(labelled, lease=number, start_frame=start, sidecars={".boxes/": ["3-x", b"the same files"]})
+            replace(
+                labelled,
+                lease=number,
+                indices=(number,),
+                start_frame=start,
+                sidecars={".boxes/": ["3-x", b"the same files"]},
+            )
             for number, start in starts.items()
         )
     )
@@ -449,10 +481,10 @@ def test_sidecars_are_read_before_their_lease_begins(server: Server, monkeypatch
         said.append(server.heard())
     assert said[-1] == LeaseFailed(5, None, "is gone", True, ".boxes/")
     assert [step for step in server.did if "way" not in step] == [
-        *("open 1", "note 1", "make 1", "note 0"),
+        *("open from 0", "note 1", "make 1", "note 0"),
         *("note 2", "make 2", "note 0"),
-        *("open 4", "note 4", "make 4", "note 0"),
-        *("open 5", "note 5", "note 0"),
+        *("open from 9", "note 4", "make 4", "note 0"),
+        *("open from 18", "note 5", "note 0"),
     ]
 
 

@@ -16,6 +16,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import ALONE_AFTER, Cause
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.quarantine import Quarantine, QuarantineEntry, clearing
+from v2v_server.worker.job import ClipJob, SampleJob
 from v2v_tools import remake as remake_module
 from v2v_tools.remake import remake
 
@@ -350,21 +351,25 @@ def remade(
     failing: tuple[str, ...] = (),
     catalogue: Catalogue = VIDEOS,
     spec: StreamSpec = SMALL_SPEC,
-) -> Lease:
-    """The lease that remake() works on in the end, when these videos cannot be decoded."""
-    leases: list[Lease] = []
+) -> SampleJob:
+    """The job that remake() works on in the end, when these videos cannot be decoded."""
+    jobs: list[SampleJob] = []
 
-    def decode_for(lease: Lease, indices: tuple[int, ...], root: object) -> tuple[Lease]:
+    def decode_for(clip: ClipJob, indices: tuple[int, ...], root: object) -> tuple[None]:
         assert indices == (index,)
-        if lease.video in failing:
-            raise VideoError(lease.video, 7, "cut short")
-        leases.append(lease)
-        return (lease,)
+        if clip.video in failing:
+            raise VideoError(clip.video, 7, "cut short")
+        return (None,)
+
+    def make_sample(job: SampleJob, decoded: None, sidecars: object) -> Sample:
+        jobs.append(job)
+        return cast(Sample, job)
 
     monkeypatch.setattr(remake_module, "decode_for", decode_for)
-    monkeypatch.setattr(remake_module, "make_sample", lambda lease, decoded, sidecars: cast(Sample, decoded))
+    monkeypatch.setattr(remake_module, "make_sample", make_sample)
     remake(catalogue, spec, seed=0, epoch=0, index=index, arrays=("voxels",), quarantine=quarantine, snapshot=snapshot)
-    return leases[0]
+    (job,) = jobs
+    return job
 
 
 def test_remake_chooses_what_the_dispatcher_chose(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -397,7 +402,7 @@ def test_remake_chooses_what_the_dispatcher_chose(monkeypatch: pytest.MonkeyPatc
     assert any(len(lease.refusals["refusals"]) > 1 for lease in done)
     for lease in done:
         again = remade(monkeypatch, at.quarantine, lease.quarantine, lease.indices[0], failing)
-        assert replace(again, lease=lease.lease) == lease
+        assert again == SampleJob.of(lease)
 
 
 def test_remake_says_what_the_dispatcher_says_when_nothing_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
