@@ -156,6 +156,69 @@ def test_server_folders_import_only_lower_folders() -> None:
     assert upward == set()
 
 
+KNOWN_CIRCLES: tuple[set[str], ...] = (
+    {f"v2v_server.corpus.{name}" for name in ("index", "sources.folder", "sources.prepared", "sources.source")},
+    {
+        f"v2v_server.simulation.{name}"
+        for name in ("clip", "effects", "effects.kernel", "effects.state", "kernels", "precision")
+    },
+)
+"""Modules that still import each other. It becomes empty with them."""
+
+
+def imports_by_module(files: dict[str, str]) -> dict[str, set[str]]:
+    """Return which of these modules each one imports, anywhere in it: functions and TYPE_CHECKING count as well.
+
+    A folder's own ``__init__`` that Python runs before a module does not count, nor the files that a registry loads by
+    names of its table.
+    """
+    graph: dict[str, set[str]] = {name: set() for name in files}
+    for name, source in files.items():
+        for node in nodes_of(source):
+            if isinstance(node, ast.Import):
+                graph[name] |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                whole = {alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+                graph[name] |= {full if full in files else str(node.module) for full in whole.values()}
+        graph[name] &= files.keys() - {name}
+    return graph
+
+
+def circles(graph: dict[str, set[str]]) -> list[set[str]]:
+    """Return the groups of modules that import each other, directly or through others of the group."""
+    reached: dict[str, set[str]] = {}
+    for name, targets in graph.items():
+        todo, reached[name] = [*targets], set()
+        while todo:
+            if (module := todo.pop()) not in reached[name]:
+                reached[name].add(module)
+                todo += graph[module]
+    groups = {frozenset(other for other in reached[name] if name in reached[other]) for name in graph}
+    return [set(group) for group in sorted(groups, key=sorted) if group]
+
+
+def test_a_circle_is_found_wherever_its_imports_stand() -> None:
+    files = {
+        "a": "def f():\n    from b import x",
+        "b": "if TYPE_CHECKING:\n    from c import d",
+        "c": "",
+        "c.d": "import a",
+        "e": "from c import d",
+    }
+    assert circles(imports_by_module(files)) == [{"a", "b", "c.d"}]
+    assert circles(imports_by_module(files | {"c.d": ""})) == []
+
+
+def test_no_modules_import_each_other() -> None:
+    files = {}
+    for package in PACKAGES:
+        for path in modules(package):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            files[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path.read_text("utf-8")
+    found = circles(imports_by_module(files))
+    assert [sorted(group) for group in found if not any(map(group.issubset, KNOWN_CIRCLES))] == []
+
+
 @pytest.mark.parametrize(
     "room",
     [

@@ -8,7 +8,7 @@ for batch in V2VStreamDataset("tcp://127.0.0.1:5555", batch_size=12):
 Modules:
 
     dataset       the dataset; batch: what it yields; delivery: samples to batches; options: what a consumer may request
-    mixture       batches of several datasets in a fixed order
+    mixture       the order of the batches of several datasets, pure
     conversation  the protocol, pure (states, messages, times); connection: runs it over a link
     memory        arenas (workers of this host write there), slots (which sample has which row), buffers (reused)
     position      which samples a consumer gets, and the state that is saved; passes: shared with loader workers
