@@ -18,9 +18,13 @@ Modules:
     loadtest      the load test; local_server: a server as a subprocess
 """
 
+import sys
+from types import ModuleType
+
 from v2v_protocol.programs import name_extra
 
 try:
+    from v2v_client import options
     from v2v_client.batch import Batch
     from v2v_client.dataset import V2VStreamDataset
     from v2v_client.in_process import V2VDataset
@@ -43,6 +47,11 @@ from v2v_protocol.errors import (
     V2VError,
     VersionMismatch,
 )
+
+# Where Patience was in release 0.2.0. Python asks for a module's package first.
+session = ModuleType("v2v_client.session")
+vars(session)["liveness"] = options
+sys.modules |= {"v2v_client.session": session, "v2v_client.session.liveness": options}
 
 __all__ = [
     "Batch",
