@@ -386,8 +386,8 @@ class V2VStreamDataset(Fixed, IterableDataset[Batch]):
                 workers and (for a rank's state) world size.
 
         Raises:
-            StateMismatch: the state belongs to another seed or spec.
-            UsageError: it is not a state, or a loader worker's state that this process cannot use.
+            StateMismatch: the state belongs to another seed or spec, or is none of this release.
+            UsageError: it is no mapping, or a loader worker's state that this process cannot use.
         """
         self._require_open()
         self._position.load(self._read_state(state), self._consumer)

@@ -466,7 +466,7 @@ FileState = tuple[int, int, int]
 or a mark of an object's ETag and 0."""
 NO_STATE: FileState = (-1, 0, 0)
 """The state cannot be told now."""
-_SEQUENCE_READER = 2
+_SEQUENCE_READER = 3
 """Raise it with every change of what probing a sequence finds: they are probed again."""
 GONE: FileState = (-2, 0, 0)
 """There is no such file."""
