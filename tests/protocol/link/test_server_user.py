@@ -187,6 +187,8 @@ def test_the_question_of_a_connection_that_has_ended_is_not_answered_to_the_next
             first.sendall(GREETING)
             assert link._questions.poll(60_000)
         with listening.accept()[0] as second:
+            second.settimeout(60.0)
+            second.recv(1, socket.MSG_PEEK)  # ZeroMQ has told of the connection before it speaks
             link.has_reconnected()  # reads the question of the first
             second.sendall(GREETING)
             assert link._questions.poll(60_000)
