@@ -266,10 +266,17 @@ class Batch(Drawn):
                 this batch is dropped.
 
         Raises:
-            UsageError: ``dtype`` is no dtype.
+            UsageError: ``device`` is no device, or ``dtype`` no dtype.
         """
         if not isinstance(dtype, torch.dtype | None):
             raise UsageError(f"batch.to({device!r}, {dtype!r}): give a torch.dtype, or non_blocking=True by its name")
+        if not isinstance(device, torch.device | torch.dtype | int | None):
+            try:
+                torch.device(device)
+            except (RuntimeError, TypeError) as error:
+                name = getattr(device, "__name__", str(device))
+                meant = f"torch.{name}" if isinstance(getattr(torch, name, None), torch.dtype) else "a torch.dtype"
+                raise UsageError(f'batch.to({device!r}): give a device, such as "cuda" or "cpu", or {meant}') from error
 
         def move(item: torch.Tensor) -> torch.Tensor:
             # PyTorch keeps page-locked memory until the copy is done, but does not track this library's memory.

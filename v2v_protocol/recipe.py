@@ -625,11 +625,7 @@ class Recipe(Persisted):
 
     def warn(self, say: Callable[[str], object] = _LOG.warning) -> None:
         """Warn of values that no real camera has, each once in a process."""
-        for name, setting in settings_of(Recipe).items():
-            line = setting.warning(f"warning: recipe {name}", getattr(self, name))
-            if line and line not in _WARNED:
-                _WARNED.add(line)
-                say(line)
+        warn_unusual("recipe ", {name: getattr(self, name) for name in settings_of(Recipe)}, say)
 
     def to_dict(self) -> dict[str, Any]:
         """Return all fields as plain values: ranges as lists, without those of later releases that are at their
@@ -664,6 +660,22 @@ class Recipe(Persisted):
         """
         require_known(changes, settings_of(Recipe), "recipe key", RecipeError)
         return dataclasses.replace(self, **changes)
+
+
+def warn_unusual(side: str, values: Mapping[str, Any], say: Callable[[str], object] = _LOG.warning) -> None:
+    """Warn of checked values that no real camera has, each once in a process.
+
+    Args:
+        side: what the names belong to, for the text.
+        values: of fields of a recipe, by name; ``threshold_pos`` and ``threshold_neg`` are thresholds.
+    """
+    known = settings_of(Recipe)
+    for name, value in values.items():
+        setting = known["threshold" if name in ("threshold_pos", "threshold_neg") else name]
+        line = setting.warning(f"warning: {side}{name}", value)
+        if line and line not in _WARNED:
+            _WARNED.add(line)
+            say(line)
 
 
 @cache

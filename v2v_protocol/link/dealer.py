@@ -338,7 +338,10 @@ def diagnose(address: str) -> str:
     except (OSError, ValueError) as error:
         return f"nothing listens there ({error}): start v2v-serve, or correct host and port"
     if greeting[:1] == b"\xff":
-        return "a server listens there, and does not answer yet; without keys it answers only root and its own user"
+        return (
+            "a server listens there, and does not answer yet; without keys it answers only root and its own user: run "
+            "this as its user, or use keys (v2v-keys init)"
+        )
     return "another program listens there, or the server's page: give the address that v2v-serve prints when ready"
 
 

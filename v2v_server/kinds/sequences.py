@@ -15,7 +15,7 @@ from v2v_server.store.pixels import IMAGE_SUFFIXES
 if TYPE_CHECKING:
     from v2v_server.video.probe import VideoFacts
 
-_READER = 2
+_READER = 3
 """Raise it with every change of what probing a sequence finds: they are probed again."""
 _QUESTIONED_BITS = 14
 """Pictures of 16 bits that need no more than these are questioned."""

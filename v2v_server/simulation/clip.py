@@ -13,7 +13,15 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import STARTS, TIME_UNITS, Recipe, effect_settings, most_events, pixel_thresholds
+from v2v_protocol.recipe import (
+    STARTS,
+    TIME_UNITS,
+    Recipe,
+    effect_settings,
+    most_events,
+    pixel_thresholds,
+    warn_unusual,
+)
 from v2v_protocol.sample import SampleParams, needs_of
 from v2v_protocol.settings import nearest, plain, require_known
 from v2v_server.simulation.draw import noise_key_of_seed
@@ -278,6 +286,10 @@ def _simulate_array(
         start_residual, start=start,
     )  # fmt: skip
     real = choose(precision, _most_events(given, ends))
+    camera = {"threshold_pos": threshold_pos, "noise_sigma": noise_sigma, "hot_pixel_sigma": hot_pixel_sigma, **effects}
+    other = {} if threshold_neg == threshold_pos else {"threshold_neg": threshold_neg}
+    of_light = {} if intensity is None else {"gamma": intensity.gamma, "log_eps": intensity.log_eps}
+    warn_unusual("", camera | other | of_light)
     if intensity is None:
         given = dataclasses.replace(given, frames=frames.astype(real))
     return Voxels.of(given, real)

@@ -233,7 +233,7 @@ class PictureSequence(VideoFile):
             first = next(iter(sorted(set(there).difference(found or there))), "")
             why = f"states times of {len(times)} pictures{f'; {first} has none' * bool(first)}"
             raise ValueError(f"{why}: give each of the {len(pictures)} pictures one, in their order")
-        return times, remark
+        return times, remark and f"{self._at[1]}: {remark}"
 
 
 @contextmanager

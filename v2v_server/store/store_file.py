@@ -35,7 +35,8 @@ from v2v_server.store.format import (
     unpack,
     unpack_record,
 )
-from v2v_server.store.planes import PLANES, Files, PlanePlace, pack_footer, read_footer
+from v2v_server.store.planes import PLANES
+from v2v_server.store.planes.plane import PlanePlace, pack_footer, read_footer
 from v2v_server.system.process import make_private
 from v2v_server.video.decode import ClipRequest, DecodedClip, DecodedPicture
 from v2v_server.video.frame_index import FrameIndex
@@ -356,7 +357,7 @@ def read_clips(files: Sequence[StoreFile], request: ClipRequest, origin: str) ->
     transfers = {head.transfer for head in heads}
     transfer = MIXED if len(transfers) > 1 else heads[0].transfer
     signal = SDR if request.most_bits is None else Signal(bits, transfer)
-    parts: Files = [(stored, _held(stored.head, request)) for stored in files]
+    parts = [(stored, _held(stored.head, request)) for stored in files]
     added = []
     for name, plane in PLANES.items():
         if plane.is_wanted(request, signal):

@@ -25,6 +25,7 @@ import signal
 import socket
 import time
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from importlib.resources.abc import Traversable
@@ -45,8 +46,8 @@ from v2v_protocol.arena import (
 )
 from v2v_protocol.errors import ProtocolError, SidecarError, UsageError, VideoError
 from v2v_protocol.keys import key_for, leaves_host
-from v2v_protocol.link.dealer import Dealer
-from v2v_protocol.messages import Buffer, Frames, Lease, Notes, Result, WorkerHello, encode_sample
+from v2v_protocol.link.dealer import Dealer, diagnose
+from v2v_protocol.messages import Buffer, Frames, Lease, Notes, Ping, Result, WorkerHello, encode, encode_sample
 from v2v_protocol.sample import Form, Layout, new_arrays
 from v2v_server.corpus.sources.sidecars import sidecar_id
 from v2v_server.corpus.sources.source import VideoSource
@@ -101,6 +102,8 @@ _LONGEST_ARENA_SECONDS = 1.0
 """Longest wait for a lease's arena, which is sent before the lease. Without it the sample goes into the message."""
 _LINGER_MS = 5000
 """Time that leaving may spend on sending the last sample."""
+_ASK_SECONDS = 3.0
+"""A server that does not answer a new worker in this time is reported before the kernels are compiled."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -536,6 +539,23 @@ def _files(clip: ClipJob) -> dict[str, str]:
     return {clip.video: clip.fingerprint, **beside}
 
 
+def _ask(address: str, keys: str | None, log: Log, *, insecure: bool) -> None:
+    """Ask whether the server answers, and say if it does not: the worker then waits, and compiles its kernels before.
+
+    Raises:
+        UsageError: see :func:`run_worker`.
+    """
+    with closing(Dealer(address, keys, "worker", insecure=insecure)) as link:
+        link.connect()
+        link.send(encode(Ping()))
+        deadline = time.monotonic() + _ASK_SECONDS
+        while time.monotonic() < deadline:
+            if link.receive(_ASK_SECONDS / 10) is not None:
+                return
+            link.has_reconnected()
+    log.say(f"{address}: {diagnose(address)}; waiting for it", "warning")
+
+
 def run_worker(
     address: str,
     source: VideoSource,
@@ -572,6 +592,8 @@ def run_worker(
     if parent_pid is not None:
         die_with_parent(parent_pid)
     key_for(address, "worker", keys)  # reports a wrong key at once
+    if logbook is None:
+        _ask(address, keys, log or Log(), insecure=insecure)
     keep_freed_memory()
     limit_memory(LARGEST_MEMORY_BYTES)
     # A worker uses one core. OpenCV reads this when it is loaded, which some recipes never do.

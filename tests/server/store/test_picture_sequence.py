@@ -247,8 +247,13 @@ def test_what_is_assumed_of_times_is_said(tmp_path: Path) -> None:
     (tmp_path / "seqs/s/timestamps.txt").write_text("4132468\n4168182\n4203896\n4239610\n")
     with opened(tmp_path / "seqs") as catalogue:
         assert catalogue.videos.frames_per_second.tolist() == pytest.approx([28], abs=0.01)
-        assert catalogue.videos[0].remark == "its times are taken for us, 28 pictures a second"
-        assert any("s/: its times are taken for us" in note for note in notes_of(catalogue))
+        assert catalogue.videos[0].remark == "timestamps.txt: its times are taken for us, 28 pictures a second"
+        assert any("s/: timestamps.txt: its times are taken for us" in note for note in notes_of(catalogue))
+    (tmp_path / "seqs/s/timestamps.txt").write_text("1\n2\n3\n4\n")
+    with opened(tmp_path / "seqs") as catalogue:
+        (note,) = notes_of(catalogue)
+        assert "s/: timestamps.txt: its numbers, 1, 2 ..., count the pictures one by one" in note
+        assert "remove the file and state the rate with --rate" in note
     write_times(tmp_path / "seqs/s/timestamps.txt", ["0", "10", "20", "30"])
     with opened(tmp_path / "seqs") as catalogue:
         assert catalogue.videos.frames_per_second.tolist() == [0.1]

@@ -132,7 +132,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from v2v_server.store.planes import Plane
+from v2v_server.store.planes.plane import Plane
 
 
 class Peaks(Plane):

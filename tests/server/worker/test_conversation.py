@@ -545,8 +545,8 @@ def test_workers_in_containers_of_one_name_do_not_share_theirs(monkeypatch: pyte
             pass
 
     monkeypatch.setattr(worker_module, "Worker", Named)
-    for asks_the_system in ("keep_freed_memory", "limit_memory", "confine", "warm_up_in_turn", "take_long_turns"):
-        monkeypatch.setattr(worker_module, asks_the_system, lambda *_, **__: None)
+    for asks in ("_ask", "keep_freed_memory", "limit_memory", "confine", "warm_up_in_turn", "take_long_turns"):
+        monkeypatch.setattr(worker_module, asks, lambda *_, **__: None)
     monkeypatch.setattr(worker_module, "gc", SimpleNamespace(collect=lambda: 0, freeze=lambda: None))
     monkeypatch.setattr(worker_module, "signal", SimpleNamespace(SIGTERM=15, signal=lambda number, handler: None))
     monkeypatch.setenv("OPENCV_FOR_THREADS_NUM", "1")
@@ -555,6 +555,37 @@ def test_workers_in_containers_of_one_name_do_not_share_theirs(monkeypatch: pyte
     assert len(set(names)) == 3
     assert names[0].startswith(f"{socket.gethostname()}-{os.getpid()}-")
     assert names[2] == "mine"
+
+
+@pytest.mark.parametrize("answers", [False, True])
+def test_a_server_that_does_not_answer_is_named_before_the_kernels_are_compiled(
+    answers: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """A server without keys never answers another user, and compiling takes a minute on a new host."""
+    said: list[str] = []
+
+    def compile_kernels() -> None:
+        said.append(capsys.readouterr().err)
+        raise InterruptedError
+
+    monkeypatch.setattr(worker_module, "warm_up_in_turn", compile_kernels)
+    monkeypatch.setattr(worker_module, "limit_memory", lambda _: None)
+    monkeypatch.setattr(worker_module, "_ASK_SECONDS", 60.0 if answers else 0.3)
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as server:
+        server.linger = 0
+        port = server.bind_to_random_port("tcp://127.0.0.1")
+
+        def answer() -> None:
+            peer, *_ = server.recv_multipart()
+            server.send_multipart([peer, *encode(Denied(ErrorCode.UNKNOWN_SESSION, "say WorkerHello"))])
+
+        thread = threading.Thread(target=answer if answers else bool)
+        thread.start()
+        with pytest.raises(InterruptedError):
+            run_worker(f"tcp://127.0.0.1:{port}", Folder(tmp_path), None, None)
+        thread.join()
+    assert (said == [""]) == answers
+    assert answers or f"tcp://127.0.0.1:{port}: a server listens there, and does not answer yet" in said[0]
 
 
 def test_workers_that_are_given_one_name_do_not_share_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
