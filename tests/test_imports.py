@@ -6,6 +6,7 @@ import ast
 import subprocess
 import sys
 from functools import cache
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -154,6 +155,20 @@ def test_server_folders_import_only_lower_folders() -> None:
             if package == "v2v_server" and FLOORS.index(other) > FLOORS.index(room):
                 upward.add((room, other))
     assert upward == set()
+
+
+@pytest.mark.parametrize("folder", ["v2v_server/simulation"])
+def test_no_file_imports_itself_by_way_of_others(folder: str) -> None:
+    """Imports in functions and for types count as well."""
+    files = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in modules(folder)}
+    files = {name.removesuffix(".__init__"): path for name, path in files.items()}
+    imports: dict[str, set[str]] = {name: set() for name in files}
+    for name, path in files.items():
+        for node in nodes_of(path.read_text("utf-8")):
+            if isinstance(node, ast.ImportFrom):
+                imports[name] |= {f"{node.module}.{each.name}" for each in node.names} | {str(node.module)}
+    own = folder.replace("/", ".")  # it offers what its files hold
+    TopologicalSorter({name: used & (files.keys() - {own}) for name, used in imports.items()}).prepare()
 
 
 @pytest.mark.parametrize(
