@@ -13,7 +13,6 @@ import pytest
     ("former", "now", "name"),
     [
         ("v2v_client.session.liveness", "v2v_client", "Patience"),
-        ("v2v_server.simulation.result", "v2v_server.simulation", "Voxels"),
     ],
 )
 def test_the_former_path_gives_the_same(former: str, now: str, name: str) -> None:

@@ -36,7 +36,7 @@ from v2v_server.simulation.pixel import PIXELS_A_BLOCK, folds_of, word
 
 FIELD, ROWS = "event_loss", 0
 NOISE, PANEL = False, "rates"
-PIXEL, STEP = np.uint32(16), np.uint32(17)
+PURPOSES = PIXEL, STEP = 1016, 1017
 
 
 def prepare(value, clip):
@@ -51,10 +51,33 @@ def after(chance, own, block, at):
             if word((word(pixel, at.first + i), step), 0) < chance:
                 block.rises[i] = block.falls[i] = block.tolerance - block.tolerance
 '''
+TILT = '''
+"""Tilt t: brighter events need 1 + t times their threshold, darker ones 1 - t times theirs."""
+
+from v2v_server.simulation.effects.state import hook
+from v2v_server.simulation.pixel import PIXELS_A_BLOCK
+
+FIELD, ROWS = "threshold_tilt", 0
+NOISE, PANEL = False, "pixels"
+
+
+def prepare(value, clip):
+    return clip.real(1 + value), clip.real(1 - value)
+
+
+@hook
+def start(shares, own, block, at):
+    for i in range(PIXELS_A_BLOCK):
+        block.positive[i] *= shares[0]
+        block.negative[i] *= shares[1]
+'''
 EFFECT_LINES = (
     ("v2v_protocol/recipe.py", "    dead_pixel_share: Range =",
-     '    event_loss: Range = span((0.0, 0.0), 0.0, 0.99, "chance that the events of a step get lost")\n'),
-    ("v2v_server/simulation/effects/__init__.py", '        "dead_pixels",', '        "event_loss",\n'),
+     '    event_loss: Range = span((0.0, 0.0), 0.0, 0.99, "chance that the events of a step get lost")\n'
+     '    threshold_tilt: Range = span((0.0, 0.0), -0.99, 0.99, "tilt of the thresholds, either way",\n'
+     '        worst=lambda tilt, _: Worst(1 - abs(tilt), 1 + abs(tilt)))\n'),
+    ("v2v_server/simulation/effects/__init__.py", '        "dead_pixels",',
+     '        "event_loss",\n        "threshold_tilt",\n'),
 )  # fmt: skip
 
 ARRAY = '''
@@ -127,7 +150,8 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_tools.remake import remake
-from v2v_server.simulation import noise
+from v2v_server.simulation import noise, simulate
+from v2v_server.simulation.draw import draw
 from v2v_server.simulation.effects import NOISE, event_loss
 from v2v_server.simulation.effects.kernel import simulate_general
 sys.path.append(sys.argv[2])
@@ -146,7 +170,7 @@ for name, recipe in (("off", Recipe(**small)), ("on", Recipe(**small, event_loss
     assert kernels == (name == "on"), "an effect that is off runs the code that ran without it"
 off, on = made["off"], made["on"]
 params = on.provenance.params
-pixel, step = words(params.noise_key, 16, np.arange(16 * 24)), words(params.noise_key, 17, np.arange(20))
+pixel, step = words(params.noise_key, 1016, np.arange(16 * 24)), words(params.noise_key, 1017, np.arange(20))
 lost = scramble(scramble(pixel)[None] + step[:, None]) < np.uint32(params.effects["event_loss"] * 2**32)
 lost = lost.reshape(20, 1, 16, 24)
 assert np.array_equal(on.arrays["voxels"], np.where(lost, 0, off.arrays["voxels"])), "the oracle"
@@ -169,6 +193,21 @@ for arrays in (("activity",), ("listed",), ("voxels", "listed"), ("activity", "t
         assert sample.arrays["listed"] == counted.sum()
     if "voxels" in arrays:
         assert np.array_equal(sample.arrays["voxels"], off.arrays["voxels"])
+# An effect on thresholds, of either sign, has the arithmetic and the bytes of a camera with these thresholds.
+frames = np.random.default_rng(1).integers(0, 256, (11, 16, 24)).astype(np.uint8)
+for threshold, precision in ((3 * 2.0**-5, "float32"), (2.0**-13, "float64")):
+    tilted = simulate(frames, threshold_pos=8 * threshold, threshold_tilt=-7 / 8, bins=10, dtype="float32")
+    assert tilted.real.__name__ == precision
+    told = simulate(
+        frames, threshold_pos=threshold, threshold_neg=15 * threshold, bins=10, dtype="float32", precision=precision
+    )
+    assert np.array_equal(tilted.voxels, told.voxels)
+tilt = Recipe(**small, threshold_tilt=(-0.9, 0.5))
+assert tilt.most_events > 9 * Recipe(**small).most_events
+signs = {np.sign(draw(tilt, seed=1, epoch=0, index=index, picture_height_px=16, picture_width_px=24,
+                      video_id="a.mp4").effects["threshold_tilt"]) for index in range(9)}
+assert signs == {-1.0, 1.0}
+assert Recipe(threshold_tilt=(-0.5, 0.0)).has_effects
 json.dump({"off": off.provenance.to_dict()["params"], "on": on.provenance.to_dict()["params"]}, sys.stdout)
 """
 
@@ -185,7 +224,8 @@ def add(root: Path, lines: tuple[tuple[str, str, str], ...]) -> None:
 def test_a_toy_effect_array_and_representation_are_a_file_and_a_line_or_two(tmp_path: Path) -> None:
     for package in ("v2v_protocol", "v2v_server", "v2v_pictures", "v2v_tools"):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
-    (tmp_path / "v2v_server/simulation/effects/event_loss.py").write_text(EFFECT)
+    for name, text in (("event_loss", EFFECT), ("threshold_tilt", TILT)):
+        (tmp_path / f"v2v_server/simulation/effects/{name}.py").write_text(text)
     add(tmp_path, EFFECT_LINES)
     (tmp_path / "v2v_server/worker/arrays/depth.py").write_text(ARRAY)
     add(tmp_path, ARRAY_LINES)

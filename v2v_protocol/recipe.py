@@ -26,10 +26,10 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -58,28 +58,58 @@ LARGEST_EVENTS = 2.0**49
 """Largest number of events of a pixel in a clip. With more, float64 no longer resolves a threshold."""
 
 
-def pixel_thresholds(smallest: float, largest: float, mismatch_sigma: float) -> tuple[float, float]:
-    """Return the limits of any pixel's threshold, for nominal thresholds between two values."""
-    spread = LARGEST_NORMAL * mismatch_sigma
-    return smallest * max(1.0 - spread, SMALLEST_THRESHOLD_SHARE), largest * (1.0 + spread)
+class Worst(NamedTuple):
+    """The most that an effect does to a pixel in a clip: ``worst(value, seconds)`` of its field.
+
+    Attributes:
+        smallest, largest: limits of the pixel's thresholds, as multiples of the nominal ones.
+        change: what is added to the changes of log intensity, summed over the clip, in thresholds of the pixel.
+    """
+
+    smallest: float = 1.0
+    largest: float = 1.0
+    change: float = 0.0
 
 
-def most_events(steps: int, log_ends: tuple[float, float], thresholds: tuple[float, float], noise_sum: float) -> float:
+def worst_of(effects: Mapping[str, Collection[float]], seconds: float) -> Worst:
+    """Return the most that effects do together.
+
+    Args:
+        effects: by field, the value of each, or the ends of its range.
+        seconds: duration of the clip.
+    """
+    cases = [
+        [setting.worst(value, seconds) for value in effects[name]]
+        for name, setting in effect_settings().items()
+        if setting.worst is not None and name in effects
+    ]
+    return Worst(
+        math.prod(min(case.smallest for case in each) for each in cases),
+        math.prod(max(case.largest for case in each) for each in cases),
+        sum(max(case.change for case in each) for each in cases),
+    )
+
+
+def most_events(
+    steps: int, log_ends: tuple[float, float], thresholds: tuple[float, float], noise_sum: float, *worst: float
+) -> float:
     """Return an upper bound of the events that one pixel can fire in a clip; it determines the arithmetic that is
     needed.
 
-    ((steps + 1) (largest threshold + range of L) + largest noise and hot drift of all steps + largest |L|), in units of
-    the smallest threshold: no step changes dL by more, and the start and the rounding of L count as one step more.
+    ((steps + 1) (largest threshold + range of L) + largest noise and drift of all steps + largest |L|), in units of the
+    smallest threshold: no step changes dL by more, and the start and the rounding of L count as one step more.
 
     Args:
         steps: differences between frames, or segments of them.
         log_ends: smallest and largest log intensity L.
-        thresholds: smallest and largest contrast threshold, log units.
-        noise_sum: standard deviations of noise and of hot drift, and the leak, summed over the steps, log units.
+        thresholds: smallest and largest nominal contrast threshold, log units.
+        noise_sum: standard deviations of noise and of hot drift, summed over the steps, log units.
+        worst: what the effects do, the values of a :class:`Worst`; without them, nothing.
     """
-    low, high = log_ends
-    change = (steps + 1) * (max(thresholds) + (high - low)) + LARGEST_NORMAL * noise_sum
-    return (change + max(abs(low), abs(high))) / min(thresholds)
+    (low, high), (least, most, added) = log_ends, Worst(*worst)
+    largest = max(thresholds) * most
+    change = (steps + 1) * (largest + (high - low)) + LARGEST_NORMAL * (noise_sum + added * largest)
+    return (change + max(abs(low), abs(high))) / (min(thresholds) * least)
 
 
 DEFAULT_PRESET = "paper"
@@ -340,6 +370,9 @@ class Recipe(Persisted):
         (0.0, 0.0), 0.0, 1.0, "standard deviation of each pixel's thresholds, as a share of the nominal ones",
         group=EFFECTS_SECTION,
         usual=(0.0, 0.3), mistake="Many pixels would fire far too easily. Divide percent by 100.",
+        worst=lambda sigma, _: Worst(
+            max(1.0 - LARGEST_NORMAL * sigma, SMALLEST_THRESHOLD_SHARE), 1.0 + LARGEST_NORMAL * sigma
+        ),
     )  # fmt: skip
     shot_noise_hz: Range = span(
         (0.0, 0.0), 0.0, 1e4,
@@ -355,6 +388,7 @@ class Recipe(Persisted):
         unit="Hz",
         usual=(0.0, 20.0),
         mistake="Every pixel would fire {0:g} events a second without a change. Divide millihertz by 1000.",
+        worst=lambda rate_hz, seconds: Worst(change=rate_hz * seconds),
     )
     refractory_seconds: Range = span(
         (0.0, 0.0),
@@ -433,7 +467,7 @@ class Recipe(Persisted):
                 )
         for name in self.log_drawn:
             low, high = getattr(self, name)
-            if low == 0.0 < high:
+            if low <= 0.0 and low < high:
                 raise RecipeError(
                     f"recipe {name} = {format_value((low, high))}: a range that is drawn in its logarithm must begin "
                     "above 0: raise its lower end, or set rate_draw to uniform"
@@ -454,7 +488,7 @@ class Recipe(Persisted):
     @property
     def has_effects(self) -> bool:
         """Return whether a draw may switch on an effect beyond the paper's model."""
-        return any(getattr(self, name)[1] > 0.0 for name in effect_settings())
+        return any(any(getattr(self, name)) for name in effect_settings())
 
     @property
     def is_world(self) -> bool:
@@ -468,9 +502,7 @@ class Recipe(Persisted):
     @property
     def timed_effects(self) -> bool:
         """Return whether a draw may switch on an effect that is stated in Hz or seconds."""
-        return any(
-            getattr(self, name)[1] > 0.0 for name, setting in effect_settings().items() if setting.unit in TIME_UNITS
-        )
+        return any(any(getattr(self, name)) for name, each in effect_settings().items() if each.unit in TIME_UNITS)
 
     @property
     def log_drawn(self) -> tuple[str, ...]:
@@ -612,16 +644,15 @@ class Recipe(Persisted):
         if thresholds is not None and self.threshold_source == "video":
             low, high = thresholds
         nominal = max(low, high)
-        smallest, largest = pixel_thresholds(min(low, high), nominal, self.threshold_mismatch_sigma[1])
         sigma = self.noise_sigma[1] * (nominal if self.noise_scales_with_threshold else 1.0)
         hot = self.hot_pixel_sigma[1] if self.hot_pixel_share[1] else 0.0
         brightest = 1.0 if self.light == "sdr" else BRIGHTEST
         ends = math.log(self.log_eps[0]), math.log1p(self.log_eps[1] + (brightest - 1.0))
         unit = step_seconds if self.noise_unit == "second" else 1.0
-        leak = self.leak_hz[1] * largest * step_seconds
         steps = self.spans * int(self.steps_at(self.frame_stride / step_seconds))
         segments = self.most_segments(steps) + steps * levels_per_step
-        return most_events(segments, ends, (smallest, largest), steps * (sigma * math.sqrt(unit) + hot * unit + leak))
+        worst = worst_of({name: getattr(self, name) for name in effect_settings()}, steps * step_seconds)
+        return most_events(segments, ends, (low, high), steps * (sigma * math.sqrt(unit) + hot * unit), *worst)
 
     def warn(self, say: Callable[[str], object] = _LOG.warning) -> None:
         """Warn of values that no real camera has, each once in a process."""

@@ -54,6 +54,7 @@ class Setting:
         mistake: what a value outside ``usual`` (``{0:g}``) means, and the unit that was probably meant.
         too_low: the same for a value below ``usual``, where that is another mistake.
         is_later: a later release added the field: a record leaves it out at its default, so older digests hold.
+        worst: for a field that is an effect of the camera, the most that a value does (``v2v_protocol.recipe.Worst``).
     """
 
     kind: Literal["whole", "bounds", "number", "range", "switch", "word", "text"]
@@ -72,6 +73,7 @@ class Setting:
     usual: tuple[float, float] = (-math.inf, math.inf)
     mistake: str = ""
     too_low: str = ""
+    worst: Callable[..., Any] | None = None
 
     @property
     def expected(self) -> str:

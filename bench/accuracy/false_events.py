@@ -20,7 +20,7 @@ from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.videos import VideoEntry, encoded_pieces
 from v2v_server.schedule import SequenceTable
 from v2v_server.simulation import simulate, simulate_log
-from v2v_server.simulation.precision import warm_up
+from v2v_server.simulation.forms import warm_up
 from v2v_server.video.rows import Rows
 from v2v_server.worker.scene_choice import CleanFrames
 from v2v_tools.motion import quiet_voxels

@@ -32,7 +32,7 @@ from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import StreamSpec
-from v2v_server.simulation.precision import warm_up
+from v2v_server.simulation.forms import warm_up
 from v2v_server.system.process import usable_cores
 
 BAR = 5.0

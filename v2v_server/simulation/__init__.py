@@ -13,7 +13,8 @@ scenes); the server worker calls :func:`simulate_clip`. The pixel model is in ``
     voxel.py          steps, segments, bins and dtypes: the definition
     effects/          effects beyond the paper's pixel, one file per effect, and the general kernel
     representations/  arrays made of events, one file per array
-    precision.py      float32, float64 or a refusal; the compiled forms of the kernels, and when they are loaded
+    precision.py      float32, float64 or a refusal; which compiled form of the kernels
+    forms.py          load these forms
     vectors.py        functions that the compiler's language lacks
 """
 

@@ -13,15 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import (
-    STARTS,
-    TIME_UNITS,
-    Recipe,
-    effect_settings,
-    most_events,
-    pixel_thresholds,
-    warn_unusual,
-)
+from v2v_protocol.recipe import STARTS, TIME_UNITS, Recipe, effect_settings, most_events, warn_unusual
 from v2v_protocol.sample import SampleParams, needs_of
 from v2v_protocol.settings import nearest, plain, require_known
 from v2v_server.simulation.draw import noise_key_of_seed
@@ -106,7 +98,7 @@ def simulate(
         if any(repr(argument) in close for argument in arguments):
             raise UsageError(f"no argument {name!r}{close}")
     require_known(effects, known, "effect")
-    effects = {name: value for name in effects if (value := known[name].single.check(name, effects[name])) > 0.0}
+    effects = {name: value for name in effects if (value := known[name].single.check(name, effects[name]))}
     if frames_per_second is not None:
         _check_number("frames_per_second", frames_per_second, positive=True)
     elif any(known[name].unit in TIME_UNITS for name in effects):
@@ -358,15 +350,12 @@ def _grey(frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def _most_events(given: KernelInput, log_ends: tuple[float, float]) -> float:
-    params, segments = given.params, given.segments
+    params = given.params
     thresholds = params.threshold_pos, params.threshold_neg
     hot_sigma = params.hot_pixel_sigma if params.hot_pixel_count else 0.0
     noise_total = noise_sum(params.noise_sigma, hot_sigma, given.noise_durations)
-    if not params.effects:
-        return most_events(segments, log_ends, thresholds, noise_total)
-    thresholds = pixel_thresholds(min(thresholds), max(thresholds), params.effects.get("threshold_mismatch_sigma", 0.0))
-    noise_total += params.effects.get("leak_hz", 0.0) * thresholds[1] * math.fsum(given.step_seconds)
-    return EFFECTS_MARGIN * most_events(segments, log_ends, thresholds, noise_total)
+    events = most_events(given.segments, log_ends, thresholds, noise_total, *given.worst)
+    return events * (EFFECTS_MARGIN if params.effects else 1.0)
 
 
 def _log_ends(intensity: Intensity) -> tuple[float, float]:

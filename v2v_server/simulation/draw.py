@@ -157,7 +157,7 @@ def draw(
         effects={
             name: value
             for name in (effect_settings() if recipe.has_effects else ())
-            if (value := _effect(recipe, name, stream(_stream_of(name), 1)[0])) > 0.0
+            if (value := _effect(recipe, name, stream(_stream_of(name), 1)[0]))
         },
         log_eps=_log_eps(recipe.log_eps, stream(Purpose.LOG_EPS, 1)[0]),
     )

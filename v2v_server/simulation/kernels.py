@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList, check_duration, whole_edges
-from v2v_protocol.recipe import pixel_thresholds
+from v2v_protocol.recipe import Worst, worst_of
 from v2v_protocol.sample import ARRAYS, EventShape, SampleParams, html_table
 from v2v_protocol.spec import VOXEL_DTYPES
 from v2v_server.simulation import effects
@@ -96,6 +97,12 @@ class KernelInput:
         """An upper bound of the number of segments."""
         divided = int(np.count_nonzero(self.edges.share))
         return len(self.noise_durations) + divided + (0 if self.levels is None else len(self.levels.at.step))
+
+    @property
+    def worst(self) -> Worst:
+        """The most that the effects do."""
+        drawn = self.params.effects.items()
+        return worst_of({name: (value,) for name, value in drawn}, math.fsum(self.step_seconds))
 
     def timeline(self) -> Timeline:
         """Divide the clip into segments."""
@@ -306,8 +313,7 @@ class _General:
             for each, own in zip(REPRESENTATIONS.values(), (*memory.values(), listing), strict=True)
         )
         clipped = np.zeros(len(made), np.int64)
-        sigma = params.effects.get("threshold_mismatch_sigma", 0.0)
-        smallest, _ = pixel_thresholds(min(params.threshold_pos, params.threshold_neg), 1.0, sigma)
+        smallest = min(params.threshold_pos, params.threshold_neg) * given.worst.smallest
         between = np.empty((0, pixels), np.uint16) if given.levels is None else given.levels.grey
         table = _table(given.intensity, real)
         law, fixed = given.law

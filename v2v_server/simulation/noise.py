@@ -43,7 +43,7 @@ Reals = npt.NDArray[np.float32]
 NoiseKey = tuple[int, int, int, int]
 
 TIME, PIXEL_RADIUS, PIXEL_ANGLE, PAIR_RADIUS, PAIR_ANGLE, START, HOT_PLACE, HOT_RADIUS, HOT_ANGLE = range(9)
-"""Purposes of words. Numbers are never reused; 9 to 15 belong to effects."""
+"""Purposes of words. Numbers are never reused; the others belong to effects, which state theirs (``PURPOSES``)."""
 
 GOLDEN = np.uint32(0x9E3779B9)
 SCRAMBLE_FACTORS = (np.uint32(0xED5AD4BB), np.uint32(0xAC4C1B51), np.uint32(0x31848BAB))

@@ -35,16 +35,11 @@ PIXELS_A_BLOCK = 512
 PITCH = PIXELS_A_BLOCK + 16  # rows a multiple of 4096 bytes apart would alias in the processor's store buffer
 ROWS_AHEAD = 3  # number of steps that a row of frames is prefetched before its use
 
-_GOLDEN = noise.GOLDEN
 _S0, _S1, _S2 = noise.SCRAMBLE_FACTORS
 _M0, _M1, _M2 = noise.MIX_FACTORS
 _L0, _L1, _L2, _L3, _L4 = noise.LOG_COEFFICIENTS
 _A0, _A1, _A2, _A3 = noise.SIN_COEFFICIENTS
 _C0, _C1, _C2, _C3 = noise.COS_COEFFICIENTS
-_SQRT_HALF_BITS, _MINUS_2_LN_2 = noise.SQRT_HALF_BITS, noise.MINUS_2_LN_2
-_PIXEL_RADIUS, _PIXEL_ANGLE = np.uint32(noise.PIXEL_RADIUS), np.uint32(noise.PIXEL_ANGLE)
-_PAIR_RADIUS, _PAIR_ANGLE = np.uint32(noise.PAIR_RADIUS), np.uint32(noise.PAIR_ANGLE)
-_START = np.uint32(noise.START)
 _ONE, _TURN, _UNIT = np.float32(1), np.float32(2.0**-32), np.float32(2.0**-24)
 _LOW_31_BITS = np.uint32(0x7FFFFFFF)
 
@@ -74,7 +69,7 @@ def _scramble(x):
 
 @numba.njit(nogil=True)
 def _fold(key, constant):
-    word = _scramble(np.uint32(constant * _GOLDEN))
+    word = _scramble(np.uint32(constant * noise.GOLDEN))
     word = _scramble(np.uint32(word + key[0]))
     word = _scramble(np.uint32(word + key[1]))
     word = _scramble(np.uint32(word + key[2]))
@@ -83,7 +78,8 @@ def _fold(key, constant):
 
 @numba.njit(nogil=True)
 def folds_of(key, purpose):
-    return _fold(key, np.uint32(2) * purpose), _fold(key, np.uint32(2) * purpose + np.uint32(1))
+    """Return the key's two words of a purpose, a whole number (``noise.py``)."""
+    return _fold(key, np.uint32(2 * purpose)), _fold(key, np.uint32(2 * purpose + 1))
 
 
 @numba.njit(nogil=True)
@@ -104,7 +100,7 @@ def words(key, purpose, counters):
         [count] uint32.
     """
     found = np.empty(len(counters), np.uint32)
-    folds = folds_of((np.uint32(key[0]), np.uint32(key[1]), np.uint32(key[2]), np.uint32(key[3])), np.uint32(purpose))
+    folds = folds_of((np.uint32(key[0]), np.uint32(key[1]), np.uint32(key[2]), np.uint32(key[3])), purpose)
     for i in range(len(counters)):
         found[i] = word(folds, counters[i])
     return found
@@ -151,9 +147,9 @@ def two_normals(radius_words, angle_words, radius_word, angle_word, x_row, y_row
         y_row[i] = np.uint32(y * _M2)
     for i in range(PIXELS_A_BLOCK):
         bits: Any = bits_of_float(np.float32(np.int32(x_row[i])))  # type: ignore[call-arg]
-        exponent = np.int32(np.int32(bits - _SQRT_HALF_BITS) >> np.int32(23))
+        exponent = np.int32(np.int32(bits - noise.SQRT_HALF_BITS) >> np.int32(23))
         normal[0, i] = float_of_bits(np.int32(bits - np.int32(exponent << np.int32(23)))) - _ONE
-        normal[1, i] = np.float32(np.int32(exponent - np.int32(31))) * _MINUS_2_LN_2
+        normal[1, i] = np.float32(np.int32(exponent - np.int32(31))) * noise.MINUS_2_LN_2
     for i in range(PIXELS_A_BLOCK):
         fraction = normal[0, i]
         square = fraction * fraction
@@ -263,9 +259,10 @@ def simulate_pixels(
     floats = aligned_rows(3, PITCH, np.float32)
     radius_words, angle_words, normal = words[0], words[1], floats[:2]
     pairs = np.empty((2, (steps + 1) // 2), np.uint32)
-    start, pixel_radius, pixel_angle = folds_of(key, _START), folds_of(key, _PIXEL_RADIUS), folds_of(key, _PIXEL_ANGLE)
+    start = folds_of(key, noise.START)
+    pixel_radius, pixel_angle = folds_of(key, noise.PIXEL_RADIUS), folds_of(key, noise.PIXEL_ANGLE)
     if noisy:
-        pair_radius, pair_angle = folds_of(key, _PAIR_RADIUS), folds_of(key, _PAIR_ANGLE)
+        pair_radius, pair_angle = folds_of(key, noise.PAIR_RADIUS), folds_of(key, noise.PAIR_ANGLE)
         for pair in range(pairs.shape[1]):
             pairs[0, pair] = word(pair_radius, pair)
             pairs[1, pair] = word(pair_angle, pair)

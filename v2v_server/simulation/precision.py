@@ -29,8 +29,8 @@ in all. The most events of such a clip are counted EFFECTS_MARGIN times, which h
 
 Everything here is sums, products and correctly rounded roots: every host comes to the same decision.
 
-Each compiled form takes seconds to compile, and there are a dozen. A worker loads the usual ones at its start. The
-others are compiled when a stream needs them, before the work on its first sample begins.
+Each compiled form takes seconds to compile, and there are a dozen. A worker loads the usual ones at its start
+(``forms.py``). The others are compiled when a stream needs them, before the work on its first sample begins.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ import numpy.typing as npt
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import LARGEST_EVENTS, Recipe
 from v2v_protocol.spec import VOXEL_DTYPES
-from v2v_server.video.picture import MOST_BITS, Signal
+from v2v_server.video.picture import MOST_BITS
 
 AUTO = "auto"
 Real = type[np.floating[Any]]
@@ -127,7 +127,7 @@ class Variant(NamedTuple):
 
 
 USUAL = frozenset({*(Variant(dtype, False, "float32") for dtype in VOXEL_DTYPES), Variant("int8", True, "float32")})
-"""Variants that :func:`warm_up` loads: every dtype of the paper's kernel, int8 of the general one."""
+"""Variants that ``forms.warm_up`` loads: every dtype of the paper's kernel, int8 of the general one."""
 
 
 def variants(
@@ -163,25 +163,3 @@ def variants(
         for precision in precisions
         for bits in depths
     )
-
-
-def load(variant: Variant) -> None:
-    """Load a variant from numba's cache, or compile it."""
-    from v2v_server.simulation.clip import simulate
-
-    simulate(
-        np.zeros((2, 1, 1), Signal(variant.bits).dtype),
-        threshold_pos=0.2,
-        bins=1,
-        dtype=variant.voxel_dtype,
-        precision=variant.precision,
-        frames_per_second=1.0,
-        bits=variant.bits,
-        shot_noise_hz=1.0 if variant.is_general else 0.0,
-    )
-
-
-def warm_up() -> None:
-    """Load, or compile, the variants that a server worker usually needs."""
-    for variant in sorted(USUAL):
-        load(variant)

@@ -28,8 +28,9 @@ from pathlib import Path
 from typing import Any
 
 from v2v_server.motion import load as load_motion
+from v2v_server.simulation.forms import load, warm_up
 from v2v_server.simulation.pixel import simulate_pixels
-from v2v_server.simulation.precision import Variant, load, warm_up
+from v2v_server.simulation.precision import Variant
 from v2v_server.system.compile_cache import sources_digest
 from v2v_server.system.process import die_with_parent, locked
 from v2v_server.worlds.clip import load as load_worlds

@@ -46,7 +46,7 @@ def simulate_recording(
         the events between the first and the last frame; ``counts`` stay those of the recording.
     """
     pixels, steps = len(recording.pixels), len(recording.frames) - 1
-    effects = {name: camera[name] for name in effect_settings() if camera.get(name, 0.0) > 0.0}
+    effects = {name: camera[name] for name in effect_settings() if camera.get(name)}
     ranges = {name: (value, value) for name, value in effects.items()}
     ranges["log_eps"] = (camera.get("log_eps", 1e-3),) * 2
     frames, light, signal = recording.frames[:, None, :], recording.known_light, SDR

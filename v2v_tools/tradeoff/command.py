@@ -19,7 +19,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import add_recipe, recipe_setting
 from v2v_protocol.write_aside import JSON, write_file, write_json
 from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.simulation.precision import warm_up
+from v2v_server.simulation.forms import warm_up
 from v2v_server.system.process import keep_freed_memory
 from v2v_server.video.rows import Rows
 from v2v_tools.tradeoff.measures import (

@@ -146,8 +146,8 @@ from dataclasses import replace
 from tests.server.simulation.test_clip import EFFECTS, FRAMES, PARAMS, RECIPE
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.kernels import simulate_general, simulate_pixels
-from v2v_server.simulation.precision import warm_up
-from v2v_server.simulation.precision import USUAL, Variant, load
+from v2v_server.simulation.forms import load, warm_up
+from v2v_server.simulation.precision import USUAL, Variant
 
 def count():
     return [len(kernel.signatures) for kernel in (simulate_pixels, simulate_general)]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import math
 from typing import Any
 
@@ -12,7 +14,7 @@ from hypothesis import strategies as st
 
 from tests.oracles.noise import shot_words, standard_normals, start_uniforms, words
 from v2v_server.simulation import noise, pixel
-from v2v_server.simulation.effects import dead_pixels
+from v2v_server.simulation.effects import EFFECTS, dead_pixels
 from v2v_server.simulation.pixel import hot_pixels
 
 KEY = (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344)
@@ -150,3 +152,13 @@ def test_shot_words_are_uniform_and_independent() -> None:
             for one, other in ((rare[1:], rare[:-1]), (rare[2:], rare[:-2]), (rare[:, 1:], rare[:, :-1])):
                 assert abs((one & other).mean() - chance**2) < 4.5 * chance / math.sqrt(n)
     assert abs(((both[0] < 0.1) & (both[1] < 0.1)).mean() - 0.01) < 4 * 0.1 / math.sqrt(n)
+
+
+def test_no_two_effects_share_a_purpose() -> None:
+    """Or their noise would be the same. An effect states each purpose that it draws words of."""
+    taken = [*range(noise.HOT_ANGLE + 1), *(each for effect in EFFECTS for each in getattr(effect, "PURPOSES", ()))]
+    assert len(set(taken)) == len(taken)
+    for effect in EFFECTS:
+        for node in ast.walk(ast.parse(inspect.getsource(effect))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in ("folds_of", "smallest_words", "words"):
+                assert getattr(effect, ast.unparse(node.args[1])) in effect.PURPOSES, effect.FIELD

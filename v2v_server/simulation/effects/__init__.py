@@ -9,12 +9,13 @@
     state.py          inputs of an effect
     kernel.py         the general kernel: all effects, and events with times
 
-An effect is one field of the recipe (``v2v_protocol.recipe``: its limits, its unit, its stream of draws) and one file
-here, named in :data:`EFFECTS`. The file states the equation, its source, and
+An effect is one field of the recipe (``v2v_protocol.recipe``: its limits, its unit, its stream of draws, and the most
+that it does) and one file here, named in :data:`EFFECTS`. The file states the equation, its source, and
 
     FIELD                     the recipe's field
     ROWS                      the number of rows of a block's state that it needs
     NOISE                     whether it fires where nothing moves: its value is then a rate in Hz
+    PURPOSES                  purposes of its words of noise (``noise.py``), numbers that no other effect has; if any
     PANEL                     the panel of ``v2v-fit`` that shows it: "rates", "still", "pixels" or "intervals"
     prepare(value, clip)      its tables; for the value 0 they have the same types and switch everything off
 

@@ -15,8 +15,7 @@ from v2v_server.simulation.pixel import PIXELS_A_BLOCK, smallest_words
 
 FIELD, ROWS = "dead_pixel_share", 0
 NOISE, PANEL = False, "pixels"
-PLACE = 15
-"""Purpose of the noise's words (``noise.py``)."""
+PURPOSES = (PLACE,) = (15,)
 
 
 def prepare(value: float, clip: Clip) -> tuple[Any, Any]:

@@ -33,10 +33,6 @@ from v2v_server.simulation.pixel import (
 from v2v_server.simulation.representations import REPRESENTATIONS, Counts, Train
 from v2v_server.simulation.vectors import aligned_rows, use_widest_vectors
 
-_PIXEL_RADIUS, _PIXEL_ANGLE = np.uint32(noise.PIXEL_RADIUS), np.uint32(noise.PIXEL_ANGLE)
-_PAIR_RADIUS, _PAIR_ANGLE = np.uint32(noise.PAIR_RADIUS), np.uint32(noise.PAIR_ANGLE)
-_START = np.uint32(noise.START)
-_TIME = np.uint32(noise.TIME)
 _UNIT = np.float32(2.0**-24)
 _FIRST_ROW = (0, *accumulate(effect.ROWS for effect in EFFECTS))
 FIXED, UNIFORM, TRIANGULAR = range(3)
@@ -136,9 +132,9 @@ def _simulate(
         floats[:4], tolerance, key,
     )  # fmt: skip
     zero = tolerance - tolerance
-    start_folds, time_folds = folds_of(key, _START), folds_of(key, _TIME)
-    pixel_radius, pixel_angle = folds_of(key, _PIXEL_RADIUS), folds_of(key, _PIXEL_ANGLE)
-    pair_radius, pair_angle = folds_of(key, _PAIR_RADIUS), folds_of(key, _PAIR_ANGLE)
+    start_folds, time_folds = folds_of(key, noise.START), folds_of(key, noise.TIME)
+    pixel_radius, pixel_angle = folds_of(key, noise.PIXEL_RADIUS), folds_of(key, noise.PIXEL_ANGLE)
+    pair_radius, pair_angle = folds_of(key, noise.PAIR_RADIUS), folds_of(key, noise.PAIR_ANGLE)
     next_hot = 0
 
     for first in range(0, pixels, PIXELS_A_BLOCK):

@@ -17,8 +17,7 @@ from v2v_server.simulation.pixel import PIXELS_A_BLOCK, folds_of, two_normals, w
 
 FIELD, ROWS = "threshold_mismatch_sigma", 0
 NOISE, PANEL = False, "pixels"
-RADIUS, ANGLE = 9, 10
-"""Purposes of the noise's words (``noise.py``)."""
+PURPOSES = RADIUS, ANGLE = 9, 10
 _ONE, _NONE = np.float32(1), np.uint32(0)
 
 
@@ -33,7 +32,7 @@ def start(tables, own, block, at):
     sigma, smallest_share = tables
     if sigma > 0:
         words, normal = block.words, block.floats
-        radius, angle = folds_of(block.key, np.uint32(RADIUS)), folds_of(block.key, np.uint32(ANGLE))
+        radius, angle = folds_of(block.key, RADIUS), folds_of(block.key, ANGLE)
         for i in range(PIXELS_A_BLOCK):
             words[0, i] = word(radius, at.first + i)
             words[1, i] = word(angle, at.first + i)

@@ -21,8 +21,7 @@ from v2v_server.simulation.vectors import bits_of_float, use_widest_vectors
 
 FIELD, ROWS = "shot_noise_hz", 0
 NOISE, PANEL = True, "still"
-PIXEL_POS, PIXEL_NEG, STEP_POS, STEP_NEG = range(11, 15)
-"""Purposes of the noise's words (``noise.py``)."""
+PURPOSES = PIXEL_POS, PIXEL_NEG, STEP_POS, STEP_NEG = range(11, 15)
 WHITE_SHOT_NOISE = 0.25
 """Shot noise of a white pixel as a share of a black one's (v2e)."""
 LARGEST_SHOT_MEAN = 64.0
@@ -93,8 +92,8 @@ def shot_table(means: Doubles) -> npt.NDArray[np.uint32]:
 def start(tables, own, block, at):
     """Compute the words of the pixels and of the steps."""
     if len(tables.shot) > 0:
-        pixel_pos, pixel_neg = folds_of(block.key, np.uint32(PIXEL_POS)), folds_of(block.key, np.uint32(PIXEL_NEG))
-        step_pos, step_neg = folds_of(block.key, np.uint32(STEP_POS)), folds_of(block.key, np.uint32(STEP_NEG))
+        pixel_pos, pixel_neg = folds_of(block.key, PIXEL_POS), folds_of(block.key, PIXEL_NEG)
+        step_pos, step_neg = folds_of(block.key, STEP_POS), folds_of(block.key, STEP_NEG)
         for i in range(PIXELS_A_BLOCK):
             tables.drawn[0, i] = word(pixel_pos, at.first + i)
             tables.drawn[1, i] = word(pixel_neg, at.first + i)
