@@ -19,7 +19,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_recordings.time_stamps import PLAUSIBLE_HZ
 from v2v_server.corpus.scenes.runs import Cleaning, Runs
 from v2v_server.corpus.scenes.scene import MOST_ANALYSED_FRAMES, NO_BARS, Sides
-from v2v_server.corpus.sources.lists import format_problems
+from v2v_server.corpus.sources.listing import format_problems
 from v2v_server.corpus.videos import SplitVideos, VideoEntry
 from v2v_server.lease_memory import MOST_CLIP_BYTES, MOST_LEASE_BYTES, frame_bytes, most_steps
 from v2v_server.simulation.draw import admits, smallest_scale
@@ -38,6 +38,7 @@ def notes_of(catalogue: Catalogue) -> list[str]:
     videos, (low, high) = catalogue.videos, PLAUSIBLE_HZ
     ids, rates = videos.ids, videos.frames_per_second
     woven, lacking = np.flatnonzero(videos.interlaced), catalogue.lacking
+    shorter, crashing = catalogue.shorter, catalogue.crashing
     remarks = {ids[at]: videos.remark[at] for at in np.flatnonzero(videos.remark).tolist()}
     is_odd = (rates > 0) & ((rates < low) | (rates > high))
     odd = {ids[at]: f"{rates[at]:.3g}" for at in np.flatnonzero(is_odd).tolist()}
@@ -63,6 +64,16 @@ def notes_of(catalogue: Catalogue) -> list[str]:
             len(odd),
             f"{counted(len(odd), 'video has a rate', 'videos have rates')} outside of {low:g} to {high:g} frames a "
             f"second{format_problems(odd)}: check the unit of their time stamps, or --rate",
+        ),
+        (len(catalogue.left_out), catalogue.left_out),
+        (
+            len(shorter),
+            f"{counted(len(shorter), 'video is', 'videos are')} shorter than the list states: {''.join(shorter[:1])}",
+        ),
+        (
+            len(crashing),
+            f"{counted(len(crashing), 'video crashes', 'videos crash')} the decoder that analyses scenes: "
+            f"{''.join(crashing[:1])}",
         ),
     )
     return [*(text for count, text in found if count), *catalogue.notes]

@@ -22,7 +22,7 @@ from v2v_protocol.spec import SCENES
 from v2v_protocol.write_aside import JSON, write_json
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.corpus.sources.lists import LIST_SUFFIXES
+from v2v_server.corpus.sources.listing import LIST_SUFFIXES
 from v2v_server.kinds.registry import KindFlags, kind_from
 from v2v_server.prepare import Report, check_destination, prepare
 from v2v_server.store.format import DEFAULT_SIZE, SIZES

@@ -22,7 +22,6 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, VideoChanged
 from v2v_protocol.messages import Lease
-from v2v_protocol.programs import counted
 from v2v_protocol.sample import ARRAYS, Refusal, RefusalKind, sidecar_endings
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.index import SCHEMA_VERSION, FigureKind, Shard, Store
@@ -36,9 +35,16 @@ from v2v_server.corpus.probe import (
     sidecar_kind,
 )
 from v2v_server.corpus.scenes.scene import Scene
-from v2v_server.corpus.sources.lists import ListEntry, format_problems, left_out_note
+from v2v_server.corpus.sources.listing import (
+    ListEntry,
+    Notice,
+    by_parts,
+    format_problems,
+    is_said,
+    left_out_note,
+    silent,
+)
 from v2v_server.corpus.sources.prepared import ABSENT, Header, Manifest, manifest_of, prepared_name, rows_of
-from v2v_server.corpus.sources.questions import Notice, by_parts, is_said, silent
 from v2v_server.corpus.sources.sidecars import sidecar_id
 from v2v_server.corpus.sources.source import (
     COPIES_GIB,
@@ -268,8 +274,8 @@ class Catalogue:
         rows: which rows of the pictures may be used.
         videos: the videos that can be used, by id.
         refusals: files, folders and lines of the list that give no video, by id.
-        notes: what the user ought to be told of opening it: an index that cannot be kept, counts that contradict the
-            list. What is wrong with the videos is worded in :mod:`v2v_server.corpus_words`.
+        notes: what the user ought to be told of opening it, such as an index that cannot be kept. What is wrong with
+            the videos is worded in :mod:`v2v_server.corpus_words`.
         digest: 32 hexadecimal digits that name this snapshot: equal digests, equal videos.
         prepared: how the folder was made if it is a prepared one (see :mod:`v2v_server.prepare`). Its videos
             are those of its source in number, order, id and frames, so that every position means the same frames;
@@ -277,6 +283,9 @@ class Catalogue:
         scene_digest: names this snapshot together with the statistics of its videos; None without them.
         sidecars: the files beside the videos that arrays can be made from, by ending.
         lacking: why videos of a prepared folder have no file, by id.
+        shorter: how videos are shorter than a list states.
+        crashing: ids of the videos that crash the decoder that analyses scenes.
+        left_out: reports files of other endings; "" if there are none.
     """
 
     source: VideoSource
@@ -289,6 +298,9 @@ class Catalogue:
     scene_digest: str | None
     sidecars: Mapping[str, Sidecars]
     lacking: Mapping[str, str]
+    shorter: Sequence[str]
+    crashing: Sequence[str]
+    left_out: str
     _store: Store = field(repr=False, compare=False)
     _scenes: SceneCollection | None = field(repr=False, compare=False)
     _unknown: frozenset[str] = field(repr=False, compare=False)
@@ -593,23 +605,11 @@ def _snapshot(
     lacking = {} if manifest is None else {id: manifest.videos[id].problem or _NO_FILE for id in sorted(absent)}
     if lacking and len(lacking) == len(videos):
         raise CorpusError(f"{source}: none of {len(absent)} prepared files is there as its manifest says")
-    if corpus.left_out:
-        notes = [*notes, corpus.left_out]
-    if shorter:
-        notes = [
-            *notes,
-            f"{counted(len(shorter), 'video is', 'videos are')} shorter than the list states: {shorter[0]}",
-        ]
     digest = videos.digest(corpus.rows)
     scene_digest, unknown = None, set(absent)
     if scenes is not None:
         split, scene_digest = scenes.read(store, table, unknown, digest)
         videos = Videos(table, thresholds, split)
-        if died := sorted(unknown - absent):
-            notes = [
-                *notes,
-                f"{counted(len(died), 'video crashes', 'videos crash')} the decoder that analyses scenes: {died[0]}",
-            ]
     marks = dict(zip(videos.ids, videos.fingerprints, strict=True)) if source.kind.has_sidecars else {}
     endings = sidecar_endings(tuple(ARRAYS))
     sidecars, said = collect_sidecars(source, store, marks, videos.shape, endings, processes, notice)
@@ -625,6 +625,9 @@ def _snapshot(
         scene_digest=scene_digest,
         sidecars=sidecars,
         lacking=lacking,
+        shorter=shorter,
+        crashing=sorted(unknown - absent),
+        left_out=corpus.left_out,
         _store=store,
         _scenes=scenes,
         _unknown=frozenset(unknown),

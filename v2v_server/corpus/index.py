@@ -25,7 +25,7 @@ import xxhash
 
 from v2v_protocol.errors import CorpusError, UsageError
 from v2v_protocol.write_aside import write_aside_and_rename
-from v2v_server.corpus.sources.questions import Notice, silent
+from v2v_server.corpus.sources.listing import Notice, silent
 from v2v_server.corpus.videos import IndexRow
 from v2v_server.system.process import make_private
 

@@ -31,8 +31,8 @@ from v2v_protocol.persisted import Persisted
 from v2v_protocol.programs import counted, printable
 from v2v_server.corpus.index import FigureKind, Figures, Store
 from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, MOST_ANALYSED_FRAMES, PIECE, Scene
+from v2v_server.corpus.sources.listing import Notice, by_parts
 from v2v_server.corpus.sources.prepared import Manifest, manifest_of
-from v2v_server.corpus.sources.questions import Notice, by_parts
 from v2v_server.corpus.sources.sidecars import files_between, open_sidecar, read_files, sidecar_id
 from v2v_server.corpus.sources.source import VideoSource, rate_of
 from v2v_server.corpus.videos import IndexRow, Sidecars, SplitVideos, VideoTable, encoded_pieces, joined

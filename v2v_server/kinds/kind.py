@@ -43,6 +43,7 @@ class VideosKind:
         name: its ``--videos-kind``.
         help: what a video is, after "is".
         forms: files of ``v2v_server/store/`` that read a video, in the order in which they are asked.
+        endings: of the ids of its videos, in lower case; no two kinds have one in common.
         looked_for: which files are videos, for messages.
         has_parts: whether a video may be a folder of files, whose id ends with a slash.
         has_listed_rates: whether a list may state the rate of a video.
@@ -62,6 +63,7 @@ class VideosKind:
     name: ClassVar[str]
     help: ClassVar[str]
     forms: ClassVar[Sequence[str]]
+    endings: ClassVar[tuple[str, ...]]
     looked_for: ClassVar[str]
     has_parts: ClassVar[bool] = False
     has_listed_rates: ClassVar[bool] = False
@@ -92,13 +94,9 @@ class VideosKind:
         """Return its part of a catalogue's digest."""
         return f"{self.name}\n"
 
-    def owns(self, id: str) -> bool:
-        """Return whether an id is that of such a video. Only the first kind owns ids that no other does."""
-        raise NotImplementedError
-
     def id_of(self, path: str) -> str:
         """Return the id of the video that a file belongs to, by its relative path; "" if it belongs to none."""
-        return path if self.owns(path) else ""
+        return path if path.lower().endswith(self.endings) else ""
 
     def listed_id(self, path: PurePosixPath) -> str:
         """Return the id of the video that a list names by this path; "" if it cannot name one."""

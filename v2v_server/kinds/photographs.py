@@ -33,7 +33,8 @@ class PhotographKind(VideosKind):
     name = "photographs"
     help = "a picture that the camera moves over"
     forms = ("photograph",)
-    looked_for = " ".join(sorted(IMAGE_SUFFIXES))
+    endings = tuple(sorted(IMAGE_SUFFIXES))
+    looked_for = " ".join(endings)
     has_sidecars = has_scenes = has_motion = False
     is_view = True
     shown_arrays = "masks", "tracks"
@@ -56,10 +57,6 @@ class PhotographKind(VideosKind):
     def frames(self) -> int:
         """Return the number of frames, those at the beginning and the end included."""
         return 1 + math.floor(min((self.photograph_seconds or 10.0) * self.rate_of(None), 1e15) + 0.5)
-
-    def owns(self, id: str) -> bool:
-        """Return whether it is the name of a picture."""
-        return id.lower().endswith(tuple(IMAGE_SUFFIXES))
 
     def rate_of(self, listed: float | None) -> float:
         """Return the rate at which all of them are shown."""

@@ -17,7 +17,7 @@ KIND_FILES = (
     "sequences",
     "photographs",
 )
-"""Files of the kinds. The first is the default, and owns the ids that no other kind does."""
+"""Files of the kinds. The first is the default, and owns ids of all other endings, which a list may name."""
 KINDS: dict[str, VideosKind] = {
     kind.name: kind for kind in (import_module(f"{__package__}.{file}").KIND for file in KIND_FILES)
 }
@@ -45,7 +45,8 @@ KindFlags: Any = make_dataclass(
 
 def kind_of(id: str) -> VideosKind:
     """Return the kind that owns the id of a catalogued video, with all flags at their defaults."""
-    return next(kind for kind in reversed(KINDS.values()) if kind.owns(id))
+    lower = id.lower()
+    return next((kind for kind in KINDS.values() if lower.endswith(kind.endings)), VIDEOS)
 
 
 def kind_from(given: Mapping[str, Any]) -> VideosKind:

@@ -28,6 +28,7 @@ class SequenceKind(VideosKind):
     name = "sequences"
     help = "a folder, or a zip archive, of numbered pictures"
     forms = "store_file", "picture_sequence"
+    endings = "/", ".zip"
     looked_for = f"folders and .zip archives of numbered {' '.join(sorted(IMAGE_SUFFIXES))}"
     has_parts = has_listed_rates = True
 
@@ -37,10 +38,6 @@ class SequenceKind(VideosKind):
         "bits, 8 to 15, that the levels of picture sequences of 16 bits hold, such as 12 for 0 to 4095; 0: all 16",
         off=True, metavar="N",
     )  # fmt: skip
-
-    def owns(self, id: str) -> bool:
-        """Return whether it is an archive, or ends with a slash."""
-        return id.lower().endswith(("/", ".zip"))
 
     def id_of(self, path: str) -> str:
         """Return an archive's own path, or a picture's folder with a slash; "" for other files."""

@@ -24,7 +24,7 @@ from v2v_server.corpus import probe as probe_module
 from v2v_server.corpus.catalogue import Catalogue, index_path, open_catalogue
 from v2v_server.corpus.probe import probe_files
 from v2v_server.corpus.sources.folder import Folder
-from v2v_server.corpus.sources.questions import silent
+from v2v_server.corpus.sources.listing import silent
 from v2v_server.corpus.sources.source import MANIFEST_NAME
 from v2v_server.corpus_words import notes_of
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint, is_same_file
@@ -277,7 +277,7 @@ def test_lists(corpus: Path, opener: Opener) -> None:
     assert ids(by_source) == ["a.mp4", "sub/b.mp4"]
     assert [(video.threshold_pos, video.threshold_neg) for video in by_source.videos] == [(None, None), (0.2, 0.3)]
     assert [refusal.video for refusal in by_source.refusals] == ["gone.mp4"]
-    assert by_source.notes == ("1 video is shorter than the list states: sub/b.mp4 has 30 frames, not 99",)
+    assert notes_of(by_source) == ["1 video is shorter than the list states: sub/b.mp4 has 30 frames, not 99"]
     # The part that the list leaves out stays in the index.
     opener(corpus)
     opener(listed)

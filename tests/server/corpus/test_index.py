@@ -31,7 +31,7 @@ from v2v_server.corpus.index import FigureKind, Figures, Store
 from v2v_server.corpus.probe import SceneCollection, figures
 from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, COLUMNS, Flag, Scene
 from v2v_server.corpus.sources.folder import Folder
-from v2v_server.corpus.sources.questions import silent
+from v2v_server.corpus.sources.listing import silent
 from v2v_server.corpus.videos import NO_THRESHOLDS, IndexRow, SplitVideos, Thresholds, Videos, VideoTable, joined
 from v2v_server.video.rows import Rows
 

@@ -18,7 +18,7 @@ from v2v_protocol.errors import VideoChanged, VideoError, VideoGone
 from v2v_protocol.sample import ArrayForm, Needs
 from v2v_server.corpus import probe as collecting
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.corpus.sources import questions, sidecars
+from v2v_server.corpus.sources import listing, sidecars
 from v2v_server.corpus.sources.sidecars import open_sidecar, read_files
 from v2v_server.corpus.sources.source import SourceOptions, open_source
 
@@ -96,7 +96,7 @@ def test_a_catalogue_knows_them_and_its_digest_does_not(
 
 def test_an_interrupted_start_keeps_what_it_has_read(corpus: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (corpus / "deep/b.x.boxes.json").write_text("[2]")
-    monkeypatch.setattr(questions, "_TOGETHER", 1)
+    monkeypatch.setattr(listing, "_TOGETHER", 1)
     read: list[str] = []
 
     def interrupted(opened: Path) -> tuple[str, bytes]:

@@ -246,7 +246,8 @@ with opened("world") as catalogue:
 @pytest.fixture
 def tree(tmp_path: Path) -> Path:
     """The files with the additions, which an import prefers to those of the packages; a clip in both formats."""
-    (tmp_path / "v2v_server/store/planes").mkdir(parents=True)
+    for name in ("store/planes", "kinds"):
+        (tmp_path / "v2v_server" / name).mkdir(parents=True)
     for name, *_ in LINES:
         shutil.copy(ROOT / name, tmp_path / name)
     add(tmp_path, LINES)

@@ -5,7 +5,6 @@ folder       a folder, a video or a list file on this host
 prepared     a folder that v2v-prepare made, and its manifest
 copies       an address in object storage
 copy_folder  copies of files that lie elsewhere, in a folder of this host
-lists        list files, and files that nothing asks for
+listing      list files, files that nothing asks for, and asking about many files at a time
 sidecars     files and folders beside a video that arrays are made from
-questions    asking about many files at a time
 """

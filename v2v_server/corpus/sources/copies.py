@@ -37,8 +37,7 @@ from v2v_protocol.errors import (
 )
 from v2v_protocol.programs import printable
 from v2v_server.corpus.sources.copy_folder import CopyFolder
-from v2v_server.corpus.sources.lists import ListEntry, count_left_out
-from v2v_server.corpus.sources.questions import answers
+from v2v_server.corpus.sources.listing import ListEntry, answers, count_left_out
 from v2v_server.corpus.sources.sidecars import is_sidecar, sidecar_fingerprint, state_of_parts, state_text
 from v2v_server.corpus.sources.source import (
     GONE,

@@ -15,8 +15,7 @@ from pathlib import Path, PurePosixPath
 from v2v_protocol.errors import CorpusError, VideoError
 from v2v_protocol.programs import printable
 from v2v_protocol.write_aside import OUTPUT_MARKER
-from v2v_server.corpus.sources.lists import LIST_SUFFIXES, ListEntry, count_left_out, read_list
-from v2v_server.corpus.sources.questions import answers
+from v2v_server.corpus.sources.listing import LIST_SUFFIXES, ListEntry, answers, count_left_out, read_list
 from v2v_server.corpus.sources.sidecars import check_local, is_sidecar, local_state, sidecar_id, state_of_parts
 from v2v_server.corpus.sources.source import (
     GONE,

@@ -26,7 +26,7 @@ import msgpack
 from v2v_protocol.errors import CorpusError, VideoGone, VideoUnreadable
 from v2v_protocol.persisted import reader, to_plain
 from v2v_server.corpus.sources.copy_folder import CopyFolder
-from v2v_server.corpus.sources.lists import ListEntry, read_list
+from v2v_server.corpus.sources.listing import ListEntry, read_list
 from v2v_server.kinds.kind import VideosKind
 from v2v_server.kinds.registry import VIDEOS, kind_from, kind_of
 from v2v_server.store.pixels import Pixels

@@ -42,6 +42,7 @@ from v2v_server.corpus.scenes.scene import (
     firsts_of,
 )  # fmt: skip
 from v2v_server.corpus.scenes.stretches import duplicated, pattern_of, runs_of
+from v2v_server.corpus_words import notes_of
 from v2v_server.system.isolate import run_twice
 from v2v_server.video.rows import Rows
 
@@ -255,7 +256,7 @@ def test_storage_that_fails_while_a_video_is_looked_at_is_asked_again(
     with opened(folder) as first:
         assert left == {"cut": 0, "whole": 0}
         assert not any(video.pieces for video in first.videos)
-        assert any("cut.mkv" in note for note in first.notes)
+        assert any("cut.mkv" in note for note in notes_of(first))
     with opened(folder) as again:
         assert again.scene_digest == digest
 

@@ -42,3 +42,9 @@ def test_an_address_of_one_video_is_opened_as_the_address_above_it(tmp_path: Pat
     again = VideoSource.from_bytes(source.to_bytes())
     assert isinstance(again, Copies)
     assert (again.name, again.bucket.url, again.bucket.only) == (source.name, f"file://{tmp_path}", "")
+
+
+def test_a_source_has_ten_methods_beside_reopening() -> None:
+    """So that one more kind of source is one more file."""
+    own = {name for name in vars(VideoSource) if callable(getattr(VideoSource, name)) and name[0] != "_"}
+    assert len(own - {"to_bytes", "from_bytes"}) <= 10, own
