@@ -73,15 +73,22 @@ THRESHOLDS = np.array([0.1, 0.18, 0.3, 0.5, 0.85])
 NEAR_WHITE_PX, DARK = 17, 0.03
 CHOOSES = np.arange(SIDE**2) % SIDE % 2 == 0
 """Blocks of the sensor on which thresholds are chosen: its even stripes. The odd ones are reported."""
-_TITLES = (
-    "recording", "light", "simulator", "at", "steps", "threshold", "correlation", "correlation_low", "correlation_high",
-    "correlation_rank", "ceiling", "brighter", "darker", "log_ratio", "log_ratio_low", "log_ratio_high",
-    "log_ratio_rank", "ratio", "intervals", "missed", "invented", "mirrored",
+
+
+def _columns(*keys: str) -> tuple[Column, ...]:
+    """Return columns: numbers with two decimals, but for those that count and that are texts."""
+    whole = ("recording", "light", "simulator", "at", "steps", "correlation_rank", "log_ratio_rank")
+    return tuple((key, key.replace("_", " "), "{}" if key in whole else "{:.2f}", 1) for key in keys)
+
+
+_COLUMNS = _columns(
+    "recording", "light", "simulator", "at", "steps", "threshold", "correlation", "ceiling", "brighter", "darker",
+    "log_ratio", "ratio", "intervals", "missed", "invented", "mirrored",
 )  # fmt: skip
-_COLUMNS: tuple[Column, ...] = tuple(
-    (key, key.replace("_", " "), "{}" if number < 5 or key.endswith("rank") else "{:.2f}", 1)
-    for number, key in enumerate(_TITLES)
-)
+_RANKED = _columns(
+    "simulator", "at", "steps", "correlation", "correlation_low", "correlation_high", "correlation_rank", "log_ratio",
+    "log_ratio_low", "log_ratio_high", "log_ratio_rank", "ratio", "intervals", "missed", "invented",
+)  # fmt: skip
 
 
 def seen(path: Path) -> tuple[Recorded, str]:
@@ -232,7 +239,7 @@ def measure(asked: argparse.Namespace) -> Report:
     if len(names) < 2:
         lines.append(f"The bar needs at least 2 recordings and was not judged: {', '.join(names) or 'none'} was read")
     return Report(
-        [*records, *whole], [(records, _COLUMNS), (whole, _COLUMNS)],
+        [*records, *whole], [(records, _COLUMNS), (whole, _RANKED)],
         [*lines, "The light of a recording cannot be told from these figures: it has to be known."],
         [*failed.values(), *(missed(whole) if len(names) > 1 else [])],
     )  # fmt: skip
