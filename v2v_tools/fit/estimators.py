@@ -221,9 +221,12 @@ def hot_pixels(
 
     value, low, high = bootstrap(sums, solve)
     most = 3.0 / float(seen.sum())
-    # A share of 1 is a tail so short that the rest of the distribution is a guess.
-    least_share = max(low[0], 0.0) if value[0] < 1.0 else 0.0
-    share = Estimate(value[0], least_share, min(max(high[0], most), 1.0), 1e-3, note)
+    # A share of 1 rests on so short a tail that the rest of the distribution is a guess.
+    share = (
+        Estimate(value[0], max(low[0], 0.0), min(max(high[0], most), 1.0), 1e-3, note)
+        if value[0] < 1.0
+        else unknown(f"{note}, but barely beyond the limit")
+    )
     if hot.sum() < 5 or value[0] >= 1.0:
         return share, unknown(note)
     # Few pixels: a bootstrap of blocks is too sure of the width of a normal distribution.
