@@ -46,6 +46,7 @@ _LAUNCHED = {
     "examples.firenet_data": "examples.firenet_data",
     "examples.ray_train": "examples.ray_train",
     "trainer.run.export": "trainer.run.export",
+    "tests.tools.trace": "tests.tools.trace",
 }
 """What `python` and `torchrun` start beside benches."""
 _STANDS_FOR_ANY = {"train.py": "the reader's own script"}

@@ -132,7 +132,7 @@ def working(arguments: list[str]) -> list[Any]:
     """What a worker is told, as the program itself understands it."""
     asked: list[Any] = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(worker_command, "open_source", lambda name, _: SimpleNamespace(name=name, make=lambda: None))
+        patch.setattr(worker_command, "open_source", lambda name, _: SimpleNamespace(name=name, copies=None))
         patch.setattr(worker_command, "run_worker", lambda *understood, **_: asked.extend(understood))
         assert worker_command.main(arguments) == 0
     return asked
