@@ -19,7 +19,7 @@ PARTS = {
 }
 """Most statements of each part, and its packages: what they have, rounded up. See docs/decisions/0018-the-house.md."""
 WAY_FILES, WAY_RETURNS = 78, 265
-"""Files that one sample visits, and returns to an earlier one. Measured 76 and 254; a busy host adds pings and waits."""
+"""Files that a sample visits, and returns to earlier ones: 76 and 254 measured; a busy host adds pings and waits."""
 
 
 @pytest.mark.parametrize("part", PARTS)
