@@ -27,7 +27,7 @@ class Sidecar(NamedTuple):
 
     Attributes:
         fingerprint: as catalogued.
-        table: the files of a folder that the clip needs, see :func:`v2v_server.corpus.sources.source.open_sidecar`.
+        table: the files of a folder that the clip needs, see :func:`v2v_server.corpus.sources.sidecars.open_sidecar`.
     """
 
     fingerprint: str
@@ -45,7 +45,7 @@ class ClipJob:
         arrays: names of the arrays to make.
         video: catalogue id; the file lies below the root of the source.
         fingerprint: expected fingerprint of the file.
-        state: state of the file when it was catalogued, see ``VideoSource.expect``; empty if unknown.
+        state: state of the file when it was catalogued, see ``VideoSource.expected``; empty if unknown.
         rows: usable rows of the picture.
         width_px, height_px: of the upright picture, before rows.
         frames_per_second: average rate; 0 if unknown.
