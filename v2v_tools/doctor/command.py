@@ -26,7 +26,7 @@ from packaging.requirements import Requirement
 
 from v2v_protocol.command import FAILED, Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
-from v2v_protocol.programs import show, version_of
+from v2v_protocol.programs import install_line, show, version_of
 from v2v_server.kinds.kind import VideosKind
 from v2v_server.kinds.registry import KindFlags, kind_from
 from v2v_server.system.process import control_group_memory, usable_cores
@@ -86,7 +86,7 @@ def run_checks(
     if videos is None:
         yield Finding(OK, "corpus", "not checked; --videos DIR checks one")
     elif missing["server"]:
-        yield Finding(BAD, "corpus", "cannot be checked without the extra 'server'", "pip install '.[server]'")
+        yield Finding(BAD, "corpus", "cannot be checked without the extra 'server'", install_line("server"))
     else:
         # Needs packages of that extra.
         corpus = importlib.import_module("v2v_tools.doctor.corpus")
@@ -123,7 +123,7 @@ def _installation(missing: dict[str, list[str]]) -> Iterator[Finding]:
             yield Finding(OK, part, "all required packages are installed")
         else:
             level = BAD if missing["server"] and missing["client"] and part != "trainer" else NOTE
-            change = f"pip install '.[{part}]' in a checkout, if you need that part on this machine"
+            change = f"{install_line(part)}, if you need that part on this machine"
             # Name the packages only if no part works: this machine may not need the others.
             text = f"not installed or too old: {', '.join(names)}" if level == BAD else "not complete"
             yield Finding(level, part, text, change)

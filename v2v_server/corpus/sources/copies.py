@@ -35,7 +35,7 @@ from v2v_protocol.errors import (
     VideoGone,
     VideoUnreadable,
 )
-from v2v_protocol.programs import printable
+from v2v_protocol.programs import install_line, printable
 from v2v_server.corpus.sources.copy_folder import CopyFolder
 from v2v_server.corpus.sources.listing import ListEntry, answers, count_left_out
 from v2v_server.corpus.sources.sidecars import is_sidecar, sidecar_fingerprint, state_of_parts, state_text
@@ -106,9 +106,8 @@ class Bucket:
             store = import_module("fsspec").filesystem(kind, **_OPTIONS.get(kind, {}))
         except ImportError as error:
             raise UsageError(
-                f"--videos {self.url}: {error}; the extra 'cloud' brings fsspec and s3fs: pip install "
-                "'.[server,cloud]' in a checkout of v2v-stream. Other stores need a package more: gcsfs for gs://, "
-                "huggingface_hub for hf://"
+                f"--videos {self.url}: {error}; the extra 'cloud' brings fsspec and s3fs: "
+                f"{install_line('server,cloud')}. Other stores need a package more: gcsfs for gs://, huggingface_hub for hf://"
             ) from error
         except ValueError as error:
             raise UsageError(f"--videos {self.url}: {error}") from error
