@@ -6,13 +6,16 @@ READY := $(VENV)/.ready
 OLD_NUMPY := .venv-old-numpy
 DOCS := .venv-docs
 PICTURE := .venv-picture
+RELEASE := .venv-release
 VIDEO ?= $(PICTURE)/clip.mp4
 CLIPS := .demo/videos
+# The address of the clone's origin, for links in the site and in a package's metadata.
+REPOSITORY = $(shell git config remote.origin.url | sed -e 's|^git@\([^:]*\):|https://\1/|' -e 's|//[^/@]*@|//|' -e 's|\.git$$||' | grep ^https)
 
 # Hundreds of test processes start; without stored bytecode each compiles every module that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help picture demo test test-slow test-old-numpy check docs format clean
+.PHONY: help picture demo test test-slow test-old-numpy check docs release format clean
 
 help:
 	@echo "make picture         the first picture, of a clip or of VIDEO=my.mp4, and how long it took: out/preview.png"
@@ -22,6 +25,7 @@ help:
 	@echo "make test-old-numpy  the table of digests under an older numpy"
 	@echo "make check           formatting, lint, types; the snippets and command lines of the pages"
 	@echo "make docs            the documentation as a site, in out/site"
+	@echo "make release         wheel, source distribution, list of components and hashes, in out/release"
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -88,12 +92,20 @@ $(DOCS)/.ready: pyproject.toml constraints.txt
 
 # The pages' own tools, apart: they need no package of ours, and ours need none of them.
 docs: $(DOCS)/.ready
-	REPOSITORY_URL=$$(git config remote.origin.url | sed -e 's|^git@\([^:]*\):|https://\1/|' -e 's|//[^/@]*@|//|' -e 's|\.git$$||' | grep ^https) \
-		NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict
+	REPOSITORY_URL=$(REPOSITORY) NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict
+
+$(RELEASE)/.ready: constraints.txt
+	$(PYTHON) -m venv $(RELEASE)
+	$(RELEASE)/bin/python -m pip install --quiet 'build>=1.2' 'cyclonedx-bom>=7' 'twine>=6.1'
+	touch $@
+
+# All of a release but the upload: out/release, from the commit, built twice with equal bytes.
+release: $(RELEASE)/.ready
+	REPOSITORY_URL=$(REPOSITORY) $(RELEASE)/bin/python deploy/release.py
 
 format: $(READY)
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
 clean:
-	rm -rf $(VENV) $(OLD_NUMPY) $(DOCS) $(PICTURE) .demo out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(OLD_NUMPY) $(DOCS) $(PICTURE) $(RELEASE) .demo out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -107,7 +107,8 @@ class Bucket:
         except ImportError as error:
             raise UsageError(
                 f"--videos {self.url}: {error}; the extra 'cloud' brings fsspec and s3fs: "
-                f"{install_line('server,cloud')}. Other stores need a package more: gcsfs for gs://, huggingface_hub for hf://"
+                f"{install_line('server,cloud')}. Other stores need a package more: gcsfs for gs://, huggingface_hub "
+                "for hf://"
             ) from error
         except ValueError as error:
             raise UsageError(f"--videos {self.url}: {error}") from error
