@@ -22,7 +22,7 @@ help:
 	@echo "make demo            reconstruct a clip, stream real ones through a server, train on them; leaves out/*.png"
 	@echo "make test            the fast tests (four minutes on two cores, the first time)"
 	@echo "make test-slow       the tests that take longer"
-	@echo "make test-old-numpy  the table of digests under an older numpy"
+	@echo "make test-old-numpy  the table of digests under an older numpy, and OpenCV without contrib"
 	@echo "make check           formatting, lint, types; the snippets and command lines of the pages"
 	@echo "make docs            the documentation as a site, in out/site"
 	@echo "make release         wheel, source distribution, list of components and hashes, in out/release"
@@ -73,6 +73,8 @@ $(OLD_NUMPY)/.ready: pyproject.toml constraints.txt
 	grep -v -i -E '^(numpy|scipy|scikit-image|matplotlib|contourpy|torch)==' constraints.txt > $(OLD_NUMPY)/constraints.txt
 	$(OLD_NUMPY)/bin/python -m pip install --quiet --constraint $(OLD_NUMPY)/constraints.txt 'numpy==2.0.*' \
 		--editable '.[server]' pytest pytest-timeout hypothesis
+	$(OLD_NUMPY)/bin/python -m pip uninstall --quiet --yes opencv-contrib-python-headless
+	$(OLD_NUMPY)/bin/python -m pip install --quiet --no-deps $$(sed -n 's/^opencv-contrib-python/opencv-python/p' constraints.txt)
 	touch $@
 
 test-old-numpy: $(OLD_NUMPY)/.ready

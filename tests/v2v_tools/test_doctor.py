@@ -137,6 +137,14 @@ def test_what_is_missing_or_too_old_is_named(
     assert install_line("server") in said
 
 
+def test_opencv_without_contrib_serves_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    here = metadata.version("opencv-contrib-python-headless")
+    pretend(monkeypatch, {"opencv-contrib-python-headless": None, "opencv-python-headless": here})
+    assert command._missing("server") == []
+    pretend(monkeypatch, {"opencv-contrib-python-headless": None, "opencv-python-headless": "4.5"})
+    assert command._missing("server") == ["opencv-contrib-python-headless>=4.10"]
+
+
 def test_a_server_without_torch_is_whole(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     pretend(monkeypatch, {"torch": None})
     monkeypatch.setattr(command, "_torch", lambda: Finding(BAD, "torch", "was loaded"))

@@ -35,6 +35,8 @@ from v2v_server.system.sandbox import can_confine
 OK, NOTE, BAD = "ok", "note", "bad"
 EXTRAS = ("server", "client", "trainer")
 """Extras of the distribution: where the videos are, where the GPU is, and there with the paper's networks."""
+_EQUIVALENT = {"opencv-contrib-python-headless": ("opencv-python-headless", "opencv-contrib-python", "opencv-python")}
+"""Packages that bring the same module; nothing that only the first one has is used."""
 NEEDED_CODECS = ("h264", "hevc", "vp8", "vp9", "libdav1d", "mpeg4", "mjpeg", "libx264")
 """Decoders of usual videos, and the encoder of films."""
 _GIB = 1 << 30
@@ -111,10 +113,10 @@ def _missing(part: str) -> list[str]:
 
 
 def _is_here(requirement: Requirement) -> bool:
-    try:
-        return requirement.specifier.contains(metadata.version(requirement.name), prereleases=True)
-    except metadata.PackageNotFoundError:
-        return False
+    for name in (requirement.name, *_EQUIVALENT.get(requirement.name, ())):
+        with suppress(metadata.PackageNotFoundError):
+            return requirement.specifier.contains(metadata.version(name), prereleases=True)
+    return False
 
 
 def _installation(missing: dict[str, list[str]]) -> Iterator[Finding]:
