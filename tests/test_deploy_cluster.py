@@ -142,8 +142,8 @@ def test_workers_connect_to_the_broker_and_have_its_videos() -> None:
     pod = container("v2v-workers")
     assert pod["command"] == ["v2v-worker"]
     port = named("Service", "v2v-broker")["spec"]["ports"][1]["port"]
-    address, source, *_ = working(pod["args"])
-    assert (address, source.name) == (f"tcp://v2v-broker:{port}", serving().videos)
+    brokers, source, *_ = working(pod["args"])
+    assert (brokers, source.name) == ((f"tcp://v2v-broker:{port}",), serving().videos)
 
 
 @pytest.mark.parametrize("deployment", ["v2v-broker", "v2v-workers"])
