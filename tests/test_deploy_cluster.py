@@ -17,8 +17,14 @@ from typing import Any
 import pytest
 import yaml
 
+from bench.processes import free_ports
+from tests.clips import write_panned
 from tests.server.page.metric_names import metric_names
+from tests.stream.conftest import SMALL_FLAGS
+from tests.trainer.training import configured, losses, trained
 from tests.waiting import until
+from trainer.run.reporting import METRICS_FILE
+from v2v_client.local_server import LocalServer
 from v2v_server.commands import serve as serve_command
 from v2v_server.commands import worker as worker_command
 from v2v_server.config import ServeConfig
@@ -28,6 +34,7 @@ DEPLOY = ROOT / "deploy"
 KUBERNETES = DEPLOY / "kubernetes"
 KUBERNETES_VERSION = "1.30"
 BATCH = DEPLOY / "slurm" / "train.sbatch"
+NODES_BATCH = DEPLOY / "slurm" / "nodes.sbatch"
 GPU_FIRST = DEPLOY.parent / "examples" / "gpu_first.sh"
 
 
@@ -204,7 +211,7 @@ def test_shellcheck_finds_nothing() -> None:
     shellcheck = Path(sys.executable).with_name("shellcheck")
     if not shellcheck.exists():
         pytest.skip("shellcheck is not installed")
-    done = subprocess.run([shellcheck, BATCH, GPU_FIRST], capture_output=True, text=True, check=False)
+    done = subprocess.run([shellcheck, BATCH, NODES_BATCH, GPU_FIRST], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (0, "")
 
 
@@ -276,3 +283,90 @@ def test_a_batch_job_that_is_terminated_twice_saves_before_it_is_requeued_and_co
     assert said(tmp_path)[-2:] == ["saved", "scontrol requeue 1234567"]
     assert start_batch(tmp_path, "exit 0").wait(timeout=60) == 0
     assert any(f"--out {tmp_path} --resume {tmp_path}/last.pt" in line for line in said(tmp_path))
+
+
+# --- several nodes: one host stands for all of them, so this says nothing of Slurm itself -----------------------------
+
+NODES = {
+    # A task a node, as srun starts them; it passes on what ends it, and ends like the worst of them.
+    "srun": """\
+while [ "${1#--}" != "$1" ]; do shift; done
+tasks=()
+for node in $(seq 0 $((SLURM_NNODES - 1))); do SLURM_NODEID=$node "$@" & tasks+=($!); done
+trap 'kill -TERM "${tasks[@]}"; interrupted=yes' TERM
+worst=0
+for task in "${tasks[@]}"; do
+    while :; do
+        interrupted="" status=0
+        wait "$task" || status=$?
+        [ -n "$interrupted" ] || break
+    done
+    [ $status -le $worst ] || worst=$status
+done
+exit $worst
+""",
+    "hostname": "echo 127.0.0.1\n",
+    "scontrol": SAYS,
+}
+
+
+def start_nodes(
+    folder: Path, nodes: int, gpus: int, *arguments: str, programs: dict[str, str] | None = None
+) -> subprocess.Popen[bytes]:
+    """Start the script for several nodes, all of them on this host."""
+    stubs = folder / "nodes"
+    stubs.mkdir(exist_ok=True)
+    for name, text in (NODES | (programs or {})).items():
+        (stubs / name).write_text(f"#!/bin/bash\n{text}")
+        (stubs / name).chmod(0o755)
+    given = {
+        "PATH": f"{stubs}:{Path(sys.executable).parent}:{os.environ['PATH']}", "LOG": str(folder / "log"),
+        "SLURM_NNODES": str(nodes), "SLURM_GPUS_ON_NODE": str(gpus), "SLURM_CPUS_ON_NODE": str(3 * gpus),
+        "SLURM_JOB_ID": str(free_ports(1)[0] - 20000), "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1",
+        "OUT": str(folder / "run"), "VIDEOS": str(folder / "clips"), "V2V_CACHE_DIR": str(folder / "cache"),
+        "SERVE_FLAGS": " ".join(SMALL_FLAGS),
+    }  # fmt: skip
+    with (folder / "output").open("ab") as output:
+        command = ["bash", NODES_BATCH, *arguments]
+        return subprocess.Popen(
+            command, env=os.environ | given, start_new_session=True, stdout=output, stderr=subprocess.STDOUT
+        )
+
+
+def test_each_node_has_a_server_and_a_rank_for_each_gpu(tmp_path: Path) -> None:
+    serve = PROGRAMS["v2v-serve"]
+    job = start_nodes(tmp_path, 2, 8, "eraft", "--set", "x=1", programs={"v2v-serve": serve, "torchrun": SAYS})
+    assert job.wait(timeout=60) == 0
+    lines = said(tmp_path)
+    assert sum(line.startswith("v2v-serve ") and "--workers 8 " in line for line in lines) == 2
+    for node in (0, 1):
+        start = f"torchrun --nnodes 2 --nproc-per-node 8 --node-rank {node} --master-addr 127.0.0.1 --master-port "
+        (line,) = [each for each in lines if each.startswith(start)]
+        end = f" -m trainer.train eraft --set x=1 --connect tcp://127.0.0.1:7 --out {tmp_path}/run"
+        assert line.endswith(end)
+    until(lambda: _is_empty(job.pid))
+
+
+@pytest.mark.slow
+def test_two_nodes_of_two_ranks_are_ended_and_continued_on_one_with_the_samples_of_one_rank(tmp_path: Path) -> None:
+    """Gloo, and a server for each node."""
+    write_panned(tmp_path / "clips", 4, 61, 48, 64)
+    config = configured(tmp_path)
+    common = (config, "--set", "run.steps=12")
+    with LocalServer(tmp_path / "clips", workers=1, flags=SMALL_FLAGS) as server:
+        alone = trained(tmp_path, server.address, "alone", run__steps=12)
+    job = start_nodes(tmp_path, 2, 2, *common, "--set", "stream.batch_size=1", "--set", "run.save_every=1")
+    metrics = tmp_path / "run" / METRICS_FILE
+    until(lambda: job.poll() is not None or (metrics.exists() and len(losses(tmp_path / "run")) >= 2))
+    job.terminate()  # as Slurm does before the time is up
+    job.wait(timeout=240)
+    output = tmp_path / "output"
+    assert [line.rpartition(" ")[0] for line in said(tmp_path)] == ["scontrol requeue"], output.read_text()
+    assert 2 <= len(losses(tmp_path / "run")) < 12, output.read_text()
+    job = start_nodes(tmp_path, 1, 2, *common, "--set", "stream.batch_size=2")
+    assert job.wait(timeout=240) == 0, output.read_text()
+    ours, theirs = losses(tmp_path / "run"), losses(alone)
+    assert [record["step"] for record in ours] == list(range(1, 13))
+    for mine, one in zip(ours, theirs, strict=True):
+        assert mine["total"] == pytest.approx(one["total"], rel=1e-4)
+        assert mine["epoch"] == one["epoch"]
