@@ -4,6 +4,7 @@ the batch script with programs that only say how they were called."""
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -50,9 +51,27 @@ def named(kind: str, name: str) -> dict[str, Any]:
     return found
 
 
-def container(deployment: str) -> dict[str, Any]:
-    (found,) = named("Deployment", deployment)["spec"]["template"]["spec"]["containers"]
-    return found
+def pod(name: str) -> dict[str, Any]:
+    """Return the template of the pods of a set or a deployment."""
+    template: dict[str, Any] = named("StatefulSet" if name == "v2v-broker" else "Deployment", name)["spec"]["template"]
+    return template
+
+
+def container(name: str) -> dict[str, Any]:
+    """Return the container of such a pod, with the values of the kustomization in its arguments."""
+    (found,) = pod(name)["spec"]["containers"]
+    assert found["envFrom"] == [{"configMapRef": {"name": "v2v-values"}}]
+    return {**found, "args": filled(found["args"])}
+
+
+def filled(arguments: list[str]) -> list[str]:
+    """Put the values of the kustomization into arguments, as Kubernetes does."""
+    return [re.sub(r"\$\((\w+)\)", lambda match: values()[match[1]], each) for each in arguments]
+
+
+def values() -> dict[str, str]:
+    (generated,) = yaml.safe_load((KUBERNETES / "kustomization.yaml").read_text())["configMapGenerator"]
+    return dict(each.split("=", 1) for each in generated["literals"])
 
 
 # --- Kubernetes -------------------------------------------------------------------------------------------------------
@@ -83,18 +102,29 @@ def build(components: list[str], folder: Path) -> list[dict[str, Any]]:
 @pytest.mark.parametrize("component", [[], ["autoscale"]])
 def test_the_kustomization_builds(component: list[str], tmp_path: Path) -> None:
     made = build(component, tmp_path / "k")
-    assert len(made) == len(documents()) + len(component)
+    assert len(made) == len(documents()) + len(component) + 1  # the values
     assert {each["metadata"].get("namespace", "v2v") for each in made} == {"v2v"}
     images = {
-        each["spec"]["template"]["spec"]["containers"][0]["image"] for each in made if each["kind"] == "Deployment"
+        each["spec"]["template"]["spec"]["containers"][0]["image"]
+        for each in made
+        if "template" in each.get("spec", {})
     }
     assert images == {"registry.example/v2v-server:1"}
+    counts = {each["metadata"]["name"]: each["spec"]["replicas"] for each in made if "replicas" in each.get("spec", {})}
+    assert counts == {"v2v-broker": len(values()["BROKERS"].split(",")), "v2v-workers": 8}
+    maps = {each["metadata"]["name"]: each["data"] for each in made if each["kind"] == "ConfigMap"}
+    (name,) = maps
+    assert maps[name] == values()
+    for each in made:
+        if "template" in each.get("spec", {}):
+            (main,) = each["spec"]["template"]["spec"]["containers"]
+            assert main["envFrom"] == [{"configMapRef": {"name": name}}]
 
 
 def test_every_pod_selector_matches_pods() -> None:
     pods = []
     for each in documents():
-        if each["kind"] == "Deployment":
+        if each["kind"] in ("Deployment", "StatefulSet"):
             pods.append(each["spec"]["template"]["metadata"]["labels"])
             assert each["spec"]["selector"]["matchLabels"] == pods[-1]
     for each in documents():
@@ -117,20 +147,20 @@ def serving() -> ServeConfig:
 
 
 def test_ports_of_the_broker_match_workers_trainers_probes_and_policies() -> None:
-    pod, config = container("v2v-broker"), serving()
-    assert pod["command"] == ["v2v-serve"]
+    main, config = container("v2v-broker"), serving()
+    assert main["command"] == ["v2v-serve"]
     ports = {port["name"]: port["port"] for port in named("Service", "v2v-broker")["spec"]["ports"]}
-    assert ports == {port["name"]: port["containerPort"] for port in pod["ports"]}
+    assert ports == {port["name"]: port["containerPort"] for port in main["ports"]}
     assert config.bind.endswith(f":{ports['consumers']}")
     assert config.worker_bind.endswith(f":{ports['workers']}")
     assert config.most_workers == 0
     for probe in ("startupProbe", "readinessProbe"):
-        assert pod[probe]["exec"]["command"] == ["test", "-s", config.port_file]
-    assert pod["livenessProbe"]["tcpSocket"]["port"] in ports
+        assert main[probe]["exec"]["command"] == ["test", "-s", config.port_file]
+    assert main["livenessProbe"]["tcpSocket"]["port"] in ports
     policy = named("NetworkPolicy", "v2v-broker")["spec"]["ingress"]
     assert [rule["ports"][0]["port"] for rule in policy] == [ports["consumers"], ports["workers"], ports["page"]]
     assert (config.page, config.page_host) == (ports["page"], "0.0.0.0")
-    annotations = named("Deployment", "v2v-broker")["spec"]["template"]["metadata"]["annotations"]
+    annotations = pod("v2v-broker")["metadata"]["annotations"]
     assert annotations["prometheus.io/port"] == str(ports["page"])
     assert policy[1]["from"][0]["podSelector"] == named("NetworkPolicy", "v2v-workers")["spec"]["podSelector"]
 
@@ -145,19 +175,23 @@ def working(arguments: list[str]) -> list[Any]:
     return asked
 
 
-def test_workers_connect_to_the_broker_and_have_its_videos() -> None:
-    pod = container("v2v-workers")
-    assert pod["command"] == ["v2v-worker"]
-    port = named("Service", "v2v-broker")["spec"]["ports"][1]["port"]
-    brokers, source, *_ = working(pod["args"])
-    assert (brokers, source.name) == ((f"tcp://v2v-broker:{port}",), serving().videos)
+def test_workers_connect_to_each_broker_and_have_its_videos(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker_command, "make_cache", lambda folder: None)
+    main = container("v2v-workers")
+    assert main["command"] == ["v2v-worker"]
+    service = named("StatefulSet", "v2v-broker")["spec"]["serviceName"]
+    port = named("Service", service)["spec"]["ports"][1]["port"]
+    brokers, source, *_ = working(main["args"])
+    assert brokers == tuple(f"tcp://v2v-broker-{number}.{service}:{port}" for number in range(2))
+    assert source.name == serving().videos
 
 
 @pytest.mark.parametrize("deployment", ["v2v-broker", "v2v-workers"])
 def test_mounted_volumes_exist(deployment: str) -> None:
-    spec = named("Deployment", deployment)["spec"]["template"]["spec"]
+    spec = pod(deployment)["spec"]
     mounts = {mount["name"]: mount["mountPath"] for mount in container(deployment)["volumeMounts"]}
-    assert set(mounts) == {volume["name"] for volume in spec["volumes"]}
+    claims = named("StatefulSet", deployment)["spec"]["volumeClaimTemplates"] if deployment == "v2v-broker" else []
+    assert set(mounts) == {volume["name"] for volume in spec["volumes"]} | {each["metadata"]["name"] for each in claims}
     cache = "state" if deployment == "v2v-broker" else "cache"
     assert f"ENV V2V_CACHE_DIR={mounts[cache]}\n" in (DEPLOY / "Dockerfile").read_text()
     assert f"--uid {spec['securityContext']['runAsUser']} " in (DEPLOY / "Dockerfile").read_text()
@@ -187,10 +221,10 @@ def test_systemd_accepts_the_units(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("deployment", ["v2v-broker", "v2v-workers"])
 def test_a_pod_has_minimal_rights(deployment: str) -> None:
-    pod = named("Deployment", deployment)["spec"]["template"]["spec"]
-    assert pod["automountServiceAccountToken"] is False
-    assert pod["securityContext"]["runAsNonRoot"] is True
-    assert pod["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
+    spec = pod(deployment)["spec"]
+    assert spec["automountServiceAccountToken"] is False
+    assert spec["securityContext"]["runAsNonRoot"] is True
+    assert spec["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
     assert container(deployment)["securityContext"] == {
         "allowPrivilegeEscalation": False, "readOnlyRootFilesystem": True, "capabilities": {"drop": ["ALL"]},
     }  # fmt: skip
