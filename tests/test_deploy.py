@@ -59,9 +59,9 @@ def test_workers_are_given_the_memory_that_the_largest_usual_clip_needs() -> Non
     arrays = layout_bytes(array_layout(spec.recipe, spec.voxel_dtype, DEFAULT_ARRAYS))
     needed = lease_bytes(VideoEntry("v.mp4", "f", 999, 3840, 2160, 30.0, "hevc"), Rows(), spec, arrays)
     assert needed <= WORKER_BYTES < 1.1 * needed
-    worker = yaml.safe_load((DEPLOY / "kubernetes" / "workers.yaml").read_text())
-    (container,) = worker["spec"]["template"]["spec"]["containers"]
-    given = [container["resources"][kind]["memory"] for kind in ("requests", "limits")]
+    (patch,) = yaml.safe_load((DEPLOY / "kubernetes" / "kustomization.yaml").read_text())["patches"]
+    (resources,) = [each["value"] for each in yaml.safe_load(patch["patch"])]
+    given = [resources[kind]["memory"] for kind in ("requests", "limits")]
     given += re.findall(r"--mem-per-cpu=(\S+)", (DEPLOY / "slurm" / "train.sbatch").read_text())
     assert [_bytes(text) for text in given] == 3 * [WORKER_BYTES]
     unit = (DEPLOY / "systemd" / "v2v-worker@.service").read_text()

@@ -356,21 +356,6 @@ class Connector:
             return
 
 
-def addresses(given: str | Sequence[str]) -> tuple[str, ...]:
-    """Return the addresses of a list or of a comma-separated text.
-
-    Raises:
-        UsageError: there is no address, or one occurs twice.
-    """
-    texts = given.split(",") if isinstance(given, str) else given if isinstance(given, Sequence) else ()
-    found = tuple(str(text).strip() for text in texts)
-    if not found or not all(found):
-        raise UsageError(f"address {given!r}: give tcp://host:port, or several of them")
-    if len(set(found)) < len(found):
-        raise UsageError(f"address {given!r}: a broker occurs twice; give each once")
-    return found
-
-
 def order(brokers: Sequence[str], consumer: int, consumers: int) -> tuple[str, ...]:
     """Return all brokers, in the order in which a consumer tries them.
 

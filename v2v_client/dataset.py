@@ -16,7 +16,7 @@ import numpy as np
 from torch.utils.data import IterableDataset, get_worker_info
 
 from v2v_client.batch import Batch
-from v2v_client.connection import Connection, Connector, addresses
+from v2v_client.connection import Connection, Connector
 from v2v_client.delivery import deliver
 from v2v_client.loaders import distributed_rank, end_with_parent, send_before_exit
 from v2v_client.local_server import LocalServer, server_flags
@@ -26,7 +26,7 @@ from v2v_client.options import Fixed, Labels, Options, Patience, check_labels, r
 from v2v_client.passes import Iteration, Position
 from v2v_client.position import Consumer, EpochPlan, ResumeState, StreamIdentity
 from v2v_protocol.errors import RepeatedSamplesWarning, StateMismatch, UsageError
-from v2v_protocol.keys import leaves_host
+from v2v_protocol.keys import addresses, leaves_host
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_INDEX, LARGEST_SEED, html_table
 from v2v_protocol.settings import format_value, require_whole

@@ -20,10 +20,11 @@ import zmq.sugar.socket
 from tests.client.fake_server import SPEC, FakeServer
 from tests.waiting import until
 from v2v_client import V2VStreamDataset
-from v2v_client.connection import Connection, addresses, order
+from v2v_client.connection import Connection, order
 from v2v_client.conversation import Conversation, Event, WorkerShortage
 from v2v_client.options import Patience
 from v2v_protocol.errors import ServerLost, StateMismatch, UsageError
+from v2v_protocol.keys import addresses
 from v2v_protocol.link import dealer
 from v2v_protocol.messages import Frames, Hello
 from v2v_protocol.sample import DEFAULT_ARRAYS

@@ -176,16 +176,16 @@ def said(actions: list[Any]) -> list[tuple[str, dict[str, Any]]]:
 
 def test_this_worker_works_for_a_frozen_server() -> None:
     hello = WorkerHello("w", NUMERICS_VERSION, 2, notes=Notes(memory_bytes=1 << 30))
-    talk = WorkerConversation(hello, "tcp://x:1", is_watched=False)
+    talk = WorkerConversation(hello, ("tcp://x:1",), is_watched=False)
     ((name, fields),) = said(talk.start(0.0))
     assert (name, fields["memory_bytes"]) == ("worker-hello", 1 << 30)
-    talk.on_messages([peer_8.write("lease", lease=7, indices=[3])], 0.0)
+    talk.on_messages([(0, peer_8.write("lease", lease=7, indices=[3]))], 0.0)
     *begun, make = talk.on_inspected(Readiness(True, True, False), 0.0)
     assert isinstance(make, Make)
     assert [name for name, _ in said(begun)] == ["begun"]
     talk.on_sample([b"header", b"array"], 0.0, Result(0))
     assert [(name, fields["lease"]) for name, fields in said(talk.on_messages([], 0.0))] == [("result", 7)]
-    *_, leave = talk.on_messages([peer_8.write("stop")], 0.0)
+    *_, leave = talk.on_messages([(0, peer_8.write("stop"))], 0.0)
     assert leave == Leave()
 
 
@@ -197,7 +197,7 @@ def test_the_reason_reaches_the_trainer_within_ten_seconds(caplog: pytest.LogCap
     talk = Conversation(
         "tcp://x:1", Hello({}, ("voxels",), 2, 7), 0, pinned=None, pinned_by="a test", patience=Patience(), now=0.0
     )
-    worker = WorkerConversation(WorkerHello("w", NUMERICS_VERSION, 2), "tcp://x:2", is_watched=False)
+    worker = WorkerConversation(WorkerHello("w", NUMERICS_VERSION, 2), ("tcp://x:2",), is_watched=False)
     now = 0.0
 
     def carry_out(actions: Any) -> None:
@@ -210,7 +210,7 @@ def test_the_reason_reaches_the_trainer_within_ten_seconds(caplog: pytest.LogCap
                     todo.extend(grant.messages(complete_lease(grant.leases[0], at.catalogue, grant.spec)))
                 case ToWorker(_, frames) if at.broker.workers:  # it has not left
                     more = {"rotation": 90} if isinstance(decode(frames[0]), Lease) else {}
-                    answers = worker.on_messages([with_fields(frames[0], **more)], now)
+                    answers = worker.on_messages([(0, with_fields(frames[0], **more))], now)
                     for answer in answers:
                         if isinstance(answer, Send):
                             todo.extend(at.dispatcher.from_worker(b"w", answer.frames, now))

@@ -108,7 +108,7 @@ class Worker:
         self.name, self.world = name, world
         self.kernels = False
         hello = WorkerHello(name.decode(), NUMERICS_VERSION, CREDIT)
-        self.conversation = WorkerConversation(hello, "queue://workers", is_watched=True)
+        self.conversation = WorkerConversation(hello, ("queue://workers",), is_watched=True)
         self.step: WorkerAction = Leave()
         world.queues.connect(name)
         self._take(self.conversation.start(world.now))
@@ -126,7 +126,7 @@ class Worker:
         match self.step:
             case Listen():
                 inbox = self.world.queues.sent[self.name]
-                messages = [frames[0] for frames in inbox]
+                messages = [(0, frames[0]) for frames in inbox]
                 inbox.clear()
                 self._take(self.conversation.on_messages(messages, self.world.now))
             case Inspect(lease):

@@ -238,6 +238,11 @@ class Dealer:
         return socket
 
 
+def wait_for_any(dealers: Sequence[Dealer], seconds: float) -> None:
+    """Wait at most ``seconds`` until one of several dealers has a message, or something happened to its connection."""
+    zmq.zmq_poll([each for dealer in dealers for each in dealer._poller.sockets], math.ceil(seconds * 1000))
+
+
 def secure(socket: zmq.Socket[bytes], key: PeerKey) -> None:
     """Set a peer's key on its socket. Call it before the socket connects."""
     socket.curve_serverkey = key.server.encode()

@@ -158,7 +158,8 @@ class Dispatcher:
                 # The catalogue lists this host's files: if the file is here, other workers can probably read it.
                 return [failure] if message.here else self.video_checked(failure, False, now)
             case Ping():
-                return [ToWorker(identity, encode(Pong()))]
+                broker.registry.set_credit(identity, message.notes.credit)
+                return [ToWorker(identity, encode(workers.pong(broker, identity))), *assign(broker, now)]
             case Goodbye():
                 broker.registry.note_unfit(message.notes.reason)
                 return [*workers.remove(broker, identity, Loss(Cause.KILLED, "left")), *assign(broker, now)]

@@ -494,6 +494,10 @@ class Member:
     takes_notes: bool = False
 
 
+def _bounded_credit(stated: int) -> int:
+    return max(1, min(stated, MOST_WORKER_CREDIT))
+
+
 def clean_name(text: str, most: int = LONGEST_NAME) -> str:
     """Make a name, or another text that a peer sent, safe to display: short, and without control characters."""
     return "".join(filter(str.isprintable, text[:most]))
@@ -534,12 +538,11 @@ class Workers:
 
     def add(self, identity: bytes, hello: WorkerHello, now: float, user: str = "", owner: bytes = b"") -> None:
         """Add a worker that said hello; none of that routing id or name is there."""
-        room = max(1, min(hello.credit, MOST_WORKER_CREDIT))
         liveness = Liveness(now, gone_seconds=SILENCE_SECONDS)
         limit_bytes = min(hello.notes.memory_bytes or LARGEST_MEMORY_BYTES, LARGEST_MEMORY_BYTES)
         self.members[identity] = Member(
-            hello.name, room, liveness, clean_name(hello.host), user, owner, limit_bytes=limit_bytes,
-            takes_notes=hello.notes != Notes(),
+            hello.name, _bounded_credit(hello.credit), liveness, clean_name(hello.host), user, owner,
+            limit_bytes=limit_bytes, takes_notes=hello.notes != Notes(),
         )  # fmt: skip
         self._names[hello.name] = identity
         self._weigh()
@@ -565,6 +568,12 @@ class Workers:
             return False
         worker.liveness.mark_heard(now)
         return True
+
+    def set_credit(self, identity: bytes, credit: int) -> None:
+        """Set how many leases a worker takes at a time; 0: no change. Those that it holds stay."""
+        if credit:
+            self.members[identity].credit = _bounded_credit(credit)
+            self._changed.add(identity)
 
     def worked(self, identity: bytes, result: Result, cpu_seconds: float) -> None:
         """Add a wanted sample to the worker's totals."""

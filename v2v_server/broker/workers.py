@@ -17,6 +17,8 @@ from v2v_protocol.messages import (
     Denied,
     ErrorCode,
     LeaseFailed,
+    Notes,
+    Pong,
     Result,
     SampleHeader,
     WorkerHello,
@@ -72,6 +74,14 @@ def _replaced_by(broker: Broker, identity: bytes, name: str, owner: bytes, user:
                 "start this one with another --name"
             )
     return before
+
+
+def pong(broker: Broker, identity: bytes) -> Pong:
+    """Answer a worker's Ping, with what this broker serves: a worker of several compares them."""
+    if not broker.registry.members[identity].takes_notes:
+        return Pong()
+    spec = broker.default_spec
+    return Pong(notes=Notes(catalogue=broker.facts.digest_under(spec.scene), spec=spec.digest))
 
 
 def accept_result(broker: Broker, identity: bytes, result: Result, payload: Sequence[Any], now: float) -> list[Action]:

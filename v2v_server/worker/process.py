@@ -24,7 +24,7 @@ import secrets
 import signal
 import socket
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -46,7 +46,7 @@ from v2v_protocol.arena import (
 )
 from v2v_protocol.errors import ProtocolError, SidecarError, UsageError, VideoError
 from v2v_protocol.keys import key_for, leaves_host
-from v2v_protocol.link.dealer import Dealer, diagnose
+from v2v_protocol.link.dealer import Dealer, diagnose, wait_for_any
 from v2v_protocol.messages import Buffer, Frames, Lease, Notes, Ping, Result, WorkerHello, encode, encode_sample
 from v2v_protocol.sample import Form, Layout, new_arrays
 from v2v_server.corpus.sources.sidecars import sidecar_id
@@ -252,7 +252,7 @@ def _map(descriptor: int, offset: int, size: int) -> npt.NDArray[np.uint8]:
 
 
 class Worker:
-    """One worker: a socket, kernels and clips, and the conversation that decides what to do with them.
+    """One worker: sockets, kernels and clips, and the conversation that decides what to do with them.
 
     Only a VideoError is reported as a failure of the video. Any other exception ends the process with a traceback. Its
     sample is then given to another worker, and a broken installation exhausts the server's crash budget instead of
@@ -261,7 +261,7 @@ class Worker:
     Args:
         name: unique name, see :func:`unshared_name`.
         source: where the videos come from.
-        address: where the server listens for workers.
+        brokers: where the brokers that it works for listen for workers.
         logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.worker.logbook`.
         cache: cache of decoded clips for later epochs; None stores nothing.
         keys: file of its key; None reads the file that ``V2V_KEYS`` names, "" uses no key.
@@ -271,7 +271,7 @@ class Worker:
         insecure: see :class:`v2v_protocol.link.dealer.Dealer`.
 
     Raises:
-        UsageError: the socket cannot connect to the address.
+        UsageError: a socket cannot connect to its address.
         KeyRefused: the key file cannot be used.
     """
 
@@ -279,7 +279,7 @@ class Worker:
         self,
         name: str,
         source: VideoSource,
-        address: str,
+        brokers: Sequence[str],
         logbook: int | None = None,
         cache: Cache | None = None,
         keys: str | None = None,
@@ -288,7 +288,7 @@ class Worker:
         *,
         insecure: bool = False,
     ) -> None:
-        self._link = Dealer(address, keys, "worker", insecure=insecure)
+        self._links = [Dealer(address, keys, "worker", insecure=insecure) for address in brokers]
         self._name = name
         self._log = log or Log()
         self._logbook = logbook
@@ -301,7 +301,7 @@ class Worker:
         self._source = source
         self._sidecars: tuple[ClipJob | None, dict[str, Traversable | None] | SidecarError] = None, {}  # the last ones
         self._unfetched: tuple[dict[str, str], VideoError] | None = None  # the last files that could not be fetched
-        self._is_remote = leaves_host(address)
+        self._are_remote = [leaves_host(address) for address in brokers]
         self._kernels = set(USUAL)  # loaded kernels
         self._handover_seconds = 0.0  # not yet reported in a result
         self._memory_bytes, self._weigh_at = 0, -math.inf
@@ -314,13 +314,14 @@ class Worker:
                 secrets.token_bytes(32),
                 notes=Notes(memory_bytes=memory_limit()),
             ),
-            address,
+            brokers,
             is_watched=logbook is not None,
         )
         try:
-            self._link.connect()
+            for link in self._links:
+                link.connect()
         except UsageError as error:
-            self._link.close()
+            self.close()
             raise UsageError(f"--connect: {error}") from error
 
     def stop(self) -> None:
@@ -331,9 +332,10 @@ class Worker:
         """Work until told to stop.
 
         Raises:
-            RemoteError: the server rejects this worker (another numerics version).
-            ProtocolError: the server speaks another version of the protocol, or a message cannot be read.
-            KeyRefused: the server rejects the key.
+            RemoteError: the only broker rejects this worker (another numerics version).
+            ProtocolError: the only broker speaks another version of the protocol, a message cannot be read, or each of
+                several brokers was left for such a reason.
+            KeyRefused: the only broker rejects the key.
         """
         try:
             actions = self._conversation.start(time.monotonic())
@@ -343,19 +345,25 @@ class Worker:
                     self._do(action)
                 actions = self._take(step)
         finally:
-            # Without a server there is no message worth waiting for.
-            self._link.disconnect(linger_ms=_LINGER_MS if self._conversation.has_server else 0)
-            self._link.close()
+            for link, broker in zip(self._links, self._conversation.brokers, strict=True):
+                # Without a server there is no message worth waiting for.
+                link.disconnect(linger_ms=_LINGER_MS if broker.is_there else 0)
+            self.close()
+
+    def close(self) -> None:
+        """Close all connections."""
+        for link in self._links:
+            link.close()
 
     def _do(self, action: WorkerAction) -> None:
         if isinstance(action, Send):
             began = time.monotonic()
-            self._link.send(action.frames)
+            self._links[action.broker].send(action.frames)
             self._handover_seconds += time.monotonic() - began
         elif isinstance(action, Reconnect) and self._find is find_memory:
             # Always with the same IP version: at most 320 s pass until the next connection, and "localhost" and most
             # names have two, of which the server listens on one.
-            self._link.connect()
+            self._links[action.broker].connect()
         elif isinstance(action, Say):
             self._log.say(f"{self._name}: {action.text}", "warning", worker=self._name)
 
@@ -376,14 +384,14 @@ class Worker:
                 self._fetch(clip, lease.indices[0])
                 self._open_sidecars(clip)
                 return conversation.on_kernels_loaded(time.monotonic())
-            case Make(lease):
+            case Make(lease, broker):
                 if not self._clips.has(ClipJob.of(lease), lease.indices[0]):
                     give_way()  # processor caches are cold before a new clip, but warm within one
                 limit_processor_time(LONGEST_LEASE_SECONDS)
                 self._at = lease.lease
                 note(self._logbook, self._at, decodes=True)
                 try:
-                    made: tuple[Frames, Result] | VideoError | SidecarError = self._make_sample(lease)
+                    made: tuple[Frames, Result] | VideoError | SidecarError = self._make_sample(lease, broker)
                 except (VideoError, SidecarError) as error:
                     made = error
                 note(self._logbook, IDLE)  # not after another exception: it ends the worker, and this lease is to blame
@@ -442,14 +450,17 @@ class Worker:
                 self._sidecars = clip, error
         return self._sidecars[1]
 
-    def _messages(self, wait_seconds: float) -> list[bytes]:
-        """Return the first frames of all available messages."""
-        messages: list[bytes] = []
-        frames = self._link.receive(wait_seconds)
-        while frames is not None:
-            messages.append(bytes(frames[0]))
-            frames = self._link.receive(0)
-        self._link.has_reconnected()  # raises if the server refuses the key; the conversation notices interruptions
+    def _messages(self, wait_seconds: float) -> list[tuple[int, bytes | UsageError]]:
+        """Return all available messages: of each its broker's number, and its first frame or why that is refused."""
+        messages: list[tuple[int, bytes | UsageError]] = []
+        wait_for_any(self._links, wait_seconds)
+        for broker, link in enumerate(self._links):
+            while (frames := link.receive(0)) is not None:
+                messages.append((broker, bytes(frames[0])))
+            try:
+                link.has_reconnected()  # raises if the server refuses the key; the conversation notices interruptions
+            except UsageError as error:
+                messages.append((broker, error))
         if messages and not self._is_confined:
             # Only now, because ZeroMQ connects in a thread of its own. No lease came before, so no video was opened.
             # A worker that loses this connection falls silent, and is ended and replaced by its server.
@@ -457,8 +468,8 @@ class Worker:
             self._is_confined = True
         return messages
 
-    def _make_sample(self, lease: Lease) -> tuple[Frames, Result]:
-        """Make a lease's sample; return its message and what it took.
+    def _make_sample(self, lease: Lease, broker: int) -> tuple[Frames, Result]:
+        """Make the sample of a broker's lease; return its message and what it took.
 
         Raises:
             VideoError, SidecarError: its video, or a file beside it, cannot be used.
@@ -493,7 +504,7 @@ class Worker:
             cpu_seconds=time.process_time() - started,
             decoded=is_new,
             cache=self._clips.said_of_cache(decoded) if is_new else "",
-            packed=self._is_remote,
+            packed=self._are_remote[broker],
         )
         work = Result(
             lease.lease,
@@ -557,7 +568,7 @@ def _ask(address: str, keys: str | None, log: Log, *, insecure: bool) -> None:
 
 
 def run_worker(
-    address: str,
+    brokers: Sequence[str],
     source: VideoSource,
     name: str | None,
     parent_pid: int | None,
@@ -569,10 +580,10 @@ def run_worker(
     *,
     insecure: bool = False,
 ) -> None:
-    """Run one worker in this process until the server stops it.
+    """Run one worker in this process until its brokers stop it.
 
     Args:
-        address: where the server listens for workers.
+        brokers: where each of them listens for workers.
         source: where the videos come from.
         name: unique name; by default host, process id and a random suffix.
         parent_pid: process id of the server if it started this worker, which then ends with it.
@@ -585,15 +596,20 @@ def run_worker(
         insecure: without a key, also work for a server on loopback that belongs to another user.
 
     Raises:
-        UsageError: the socket cannot connect to the address, or the server rejects the key or belongs to another user.
-        RemoteError: the server rejects this worker.
-        ProtocolError: the server speaks another version of the protocol, or a message cannot be read.
+        UsageError: a socket cannot connect to its address, or the only broker rejects the key or belongs to another
+            user.
+        RemoteError, ProtocolError: see :meth:`Worker.run`.
     """
     if parent_pid is not None:
         die_with_parent(parent_pid)
-    key_for(address, "worker", keys)  # reports a wrong key at once
-    if logbook is None:
-        _ask(address, keys, log or Log(), insecure=insecure)
+    for address in brokers:
+        key_for(address, "worker", keys)  # reports a wrong key at once
+        if logbook is None:
+            try:
+                _ask(address, keys, log or Log(), insecure=insecure)
+            except UsageError:
+                if len(brokers) == 1:  # one of several must not keep the worker from the others; it is asked again
+                    raise
     keep_freed_memory()
     limit_memory(LARGEST_MEMORY_BYTES)
     # A worker uses one core. OpenCV reads this when it is loaded, which some recipes never do.
@@ -604,14 +620,14 @@ def run_worker(
     gc.collect()
     gc.freeze()
     # Before ZeroMQ starts its threads, so that these are confined to the same files.
-    pool = socket.socket(fileno=arenas) if arenas is not None and address.startswith("ipc:") else None
+    pool = socket.socket(fileno=arenas) if arenas is not None and brokers[0].startswith("ipc:") else None
     if pool is not None:
         pool.settimeout(_LONGEST_ARENA_SECONDS)
     written = [*compile_cache(), *([] if cache is None else [cache.folder])]
     # The tools for object storage write elsewhere, and a worker of this host without a pool opens arenas itself.
-    confines_files = source.is_local and (pool is not None or leaves_host(address))
+    confines_files = source.is_local and (pool is not None or all(map(leaves_host, brokers)))
     confine(written if confines_files else None, network=True)
-    worker = Worker(name or unshared_name(None), source, address, logbook, cache, keys, log, pool, insecure=insecure)
+    worker = Worker(name or unshared_name(None), source, brokers, logbook, cache, keys, log, pool, insecure=insecure)
     signal.signal(signal.SIGTERM, lambda number, frame: worker.stop())
     # After ZeroMQ's threads have started, which should run without delay.
     take_long_turns()

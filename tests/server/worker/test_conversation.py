@@ -106,7 +106,7 @@ class Talk:
         self.unready: set[int] = set()
         self.compiled = True
         self.decoded: set[int] = set()
-        self.conversation = WorkerConversation(HELLO, "tcp://there", is_watched=is_watched)
+        self.conversation = WorkerConversation(HELLO, ("tcp://there",), is_watched=is_watched)
         self.step: WorkerAction = Leave()
         self._take(self.conversation.start(self.now))
         assert self.said() == [HELLO]
@@ -134,7 +134,7 @@ class Talk:
 
     def hears(self, *messages: Message) -> list[Message]:
         assert isinstance(self.step, Listen)
-        self._take(self.conversation.on_messages([encode(message)[0] for message in messages], self.now))
+        self._take(self.conversation.on_messages([(0, encode(message)[0]) for message in messages], self.now))
         return self.said()
 
     def makes(self, number: int, frames: Frames = IN_SLOT, seconds: float = 0.0) -> list[Message]:
@@ -239,13 +239,13 @@ def test_a_silent_server_is_greeted_over_a_new_connection() -> None:
 
 def test_a_message_is_waited_for_only_if_a_server_was_there_lately() -> None:
     talk = Talk()
-    found = [talk.conversation.has_server]
+    found = [talk.conversation.brokers[0].is_there]
     for message in (Pong(), None, Pong()):
         talk.now += 5.0
         talk.hears(*([] if message is None else [message]))
-        found.append(talk.conversation.has_server)
+        found.append(talk.conversation.brokers[0].is_there)
     assert found == [False, True, False, True]
-    assert at_work(1, 2).conversation.has_server
+    assert at_work(1, 2).conversation.brokers[0].is_there
 
 
 def test_the_time_that_a_sample_takes_is_no_silence() -> None:
@@ -261,7 +261,7 @@ def test_a_worker_that_cannot_read_its_server_reports_what_it_made_says_why_and_
     for unreadable, why in ((b"nonsense", "not a message"), (later, "Lease has no field 'rotation'")):
         talk = at_work(1)
         talk.makes(1)
-        talk._take(talk.conversation.on_messages([unreadable, encode(lease(3))[0]], talk.now))
+        talk._take(talk.conversation.on_messages([(0, unreadable), (0, encode(lease(3))[0])], talk.now))
         result, goodbye = talk.said()
         assert (result, type(goodbye)) == (Result(1, begins=0), Goodbye)
         assert isinstance(talk.step, Leave)
@@ -273,7 +273,7 @@ def test_a_server_of_another_version_ends_the_worker() -> None:
     """It says so in its own version, which is no message to ours; to ask it again every five seconds is no use."""
     denial = msgpack.packb({"v": PROTOCOL_VERSION + 1, "t": "denied", "code": "version", "text": "", "more": 0})
     with pytest.raises(VersionMismatch, match=f"version {PROTOCOL_VERSION + 1}"):
-        Talk().conversation.on_messages([denial], 0.0)
+        Talk().conversation.on_messages([(0, denial)], 0.0)
 
 
 def test_a_server_that_does_not_want_this_worker_ends_it() -> None:
@@ -372,7 +372,7 @@ def working(folder: Path) -> Iterator[Server]:
         router.setsockopt(zmq.LINGER, 0)
         at = Server(router)
         port = router.bind_to_random_port("tcp://127.0.0.1")
-        worker = Worker("w", Folder(folder), f"tcp://127.0.0.1:{port}", logbook.fileno())
+        worker = Worker("w", Folder(folder), [f"tcp://127.0.0.1:{port}"], logbook.fileno())
         thread = threading.Thread(target=worker.run)
         thread.start()
         try:
@@ -494,38 +494,38 @@ def test_a_new_connection_has_a_new_routing_id(tmp_path: Path) -> None:
         at = Server(router)
         port = router.bind_to_random_port("tcp://127.0.0.1")
         # Without the question of whose server it is, the handshake needs no call of the worker.
-        worker = Worker("w", Folder(tmp_path), f"tcp://127.0.0.1:{port}", insecure=True)
+        worker = Worker("w", Folder(tmp_path), [f"tcp://127.0.0.1:{port}"], insecure=True)
         found = []
         try:
             for _ in range(2):
                 worker._do(Send(encode(Ping())))
                 assert at.heard() == Ping()
                 at.says(Pong())
-                assert wait([worker._link], WAIT_MS / 1000)
-                assert [decode(frame) for frame in worker._messages(0.0)] == [Pong()]
+                assert wait(worker._links, WAIT_MS / 1000)
+                assert [(broker, decode(frame)) for broker, frame in worker._messages(0.0)] == [(0, Pong())]
                 found.append(at.worker)
                 worker._do(Reconnect())
         finally:
-            worker._link.close()
+            worker.close()
     assert len(set(found)) == 2
     assert all(len(identity) == 16 and identity != b"w" for identity in found)
 
 
 def test_a_worker_whose_server_is_away_keeps_to_the_ip_version(tmp_path: Path, unused_port: int) -> None:
     """With the other one it would not find the server again until its next new connection, minutes later."""
-    worker = Worker("w", Folder(tmp_path), f"tcp://localhost:{unused_port}")
+    worker = Worker("w", Folder(tmp_path), [f"tcp://localhost:{unused_port}"])
     try:
         for _ in range(3):
             worker._do(Reconnect())
-            assert worker._link._socket is not None
-            assert worker._link._socket.getsockopt(zmq.IPV6) == 0
+            assert worker._links[0]._socket is not None
+            assert worker._links[0]._socket.getsockopt(zmq.IPV6) == 0
     finally:
-        worker._link.close()
+        worker.close()
 
 
 def test_a_malformed_address_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"--connect: address 'nowhere': .*; give tcp://host:port"):
-        Worker("w", Folder(tmp_path), "nowhere")
+        Worker("w", Folder(tmp_path), ["nowhere"])
 
 
 def test_a_corpus_that_cannot_be_looked_at_is_said(capsys: pytest.CaptureFixture[str]) -> None:
@@ -551,7 +551,7 @@ def test_workers_in_containers_of_one_name_do_not_share_theirs(monkeypatch: pyte
     monkeypatch.setattr(worker_module, "signal", SimpleNamespace(SIGTERM=15, signal=lambda number, handler: None))
     monkeypatch.setenv("OPENCV_FOR_THREADS_NUM", "1")
     for name in (None, None, "mine"):
-        run_worker("tcp://127.0.0.1:5556", Folder(tmp_path), name, None)
+        run_worker(["tcp://127.0.0.1:5556"], Folder(tmp_path), name, None)
     assert len(set(names)) == 3
     assert names[0].startswith(f"{socket.gethostname()}-{os.getpid()}-")
     assert names[2] == "mine"
@@ -582,7 +582,7 @@ def test_a_server_that_does_not_answer_is_named_before_the_kernels_are_compiled(
         thread = threading.Thread(target=answer if answers else bool)
         thread.start()
         with pytest.raises(InterruptedError):
-            run_worker(f"tcp://127.0.0.1:{port}", Folder(tmp_path), None, None)
+            run_worker([f"tcp://127.0.0.1:{port}"], Folder(tmp_path), None, None)
         thread.join()
     assert (said == [""]) == answers
     assert answers or f"tcp://127.0.0.1:{port}: a server listens there, and does not answer yet" in said[0]
@@ -592,7 +592,7 @@ def test_workers_that_are_given_one_name_do_not_share_it(monkeypatch: pytest.Mon
     """A batch system starts all of them with the same command."""
     names: list[str] = []
     monkeypatch.setattr(
-        "v2v_server.commands.worker.run_worker", lambda address, root, name, *_, **__: names.append(name)
+        "v2v_server.commands.worker.run_worker", lambda brokers, root, name, *_, **__: names.append(name)
     )
     command = ["--connect", "tcp://127.0.0.1:5556", "--videos", str(tmp_path), "--name", "node7"]
     for more in ([], [], ["--logbook-fd", "3"]):
