@@ -45,7 +45,7 @@ from v2v_server.corpus.sources.listing import (
     left_out_note,
     silent,
 )
-from v2v_server.corpus.sources.prepared import ABSENT, Header, Manifest, manifest_of, prepared_name, rows_of
+from v2v_server.corpus.sources.prepared import ABSENT, Header, Manifest, manifest_of, rows_of
 from v2v_server.corpus.sources.sidecars import sidecar_id
 from v2v_server.corpus.sources.source import (
     COPIES_GIB,
@@ -129,7 +129,7 @@ def list_corpus(source: VideoSource, rows: Rows | None, notice: Notice) -> Corpu
             ids.append(id)
         if is_said(len(ids)):
             notice(f"looking for videos in {source}: {len(ids)} so far")
-    note = left_out_note(left_out)
+    note = left_out_note(left_out, has_videos=bool(ids))
     if not ids:
         raise _no_video(source, refused, note)
     return Corpus(source, rows, tuple(ids), refused, note)
@@ -327,13 +327,14 @@ class Catalogue:
         return self.source.folder
 
     def path(self, id: str) -> Path:
-        """Return where the video lies.
+        """Return where the video lies; of a member of an archive, what a FileRange is as a path.
 
         Raises:
             CorpusError: there is no such id in this catalogue, or no such folder on this host.
         """
-        self._fingerprint(id)
-        return self.folder / (id if self.prepared is None else prepared_name(id))
+        self.source.expected = id, self.state(id) or ()
+        with self.folder and self.source.open_local(id, "") as path:
+            return Path(os.fspath(path))
 
     def check(self, id: str, fingerprint: str, sidecar: str = "") -> None:
         """Check that the video is as catalogued, or its sidecar of that ending, see :meth:`VideoSource.verify`.

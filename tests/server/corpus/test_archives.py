@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import io
 import os
+import re
 import shutil
-from collections.abc import Mapping
+import tarfile
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
+from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from PIL import Image
 
 from tests.clips import panned_luma, truncated, write_clip
@@ -19,8 +26,10 @@ from tests.packed import pack, packed_forms
 from v2v_protocol.errors import CorpusError, VideoChanged, VideoGone, VideoUnreadable
 from v2v_server.corpus import members
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.corpus.sources import archives
 from v2v_server.corpus.sources.sidecars import open_sidecar, read_files
-from v2v_server.corpus.sources.source import SourceOptions, open_source
+from v2v_server.corpus.sources.source import MANIFEST_NAME, SourceOptions, open_source
+from v2v_server.prepare import prepare
 from v2v_server.video.file_range import FileRange, open_bytes
 
 ROW = Row({"bins": 1, "voxels_per_clip": 2}, count=12)
@@ -227,3 +236,197 @@ def test_sidecars_are_found_in_archives_as_beside_files(tmp_path: Path) -> None:
                     pass
     assert found["tar"] == found["zip"] == found["folder"]
     assert {ending for ending, videos in found["tar"][0].items() if videos} == {".boxes.json", ".masks/"}
+
+
+def tar_of(path: Path, *members: tuple[str, bytes], **fields: Any) -> bytes:
+    """A tar file; fields of the headers may be replaced."""
+    with tarfile.open(path, "w", format=tarfile.GNU_FORMAT) as tar:
+        for name, data in members:
+            info = tarfile.TarInfo(name)
+            info.size = len(data)
+            for key, value in fields.items():
+                setattr(info, key, value)
+            tar.addfile(info, io.BytesIO(data))
+    return path.read_bytes()
+
+
+def zip_of(path: Path, *members: tuple[str, bytes], method: int = ZIP_STORED) -> bytes:
+    with ZipFile(path, "w", method) as packed:
+        for name, data in members:
+            packed.writestr(name, data)
+    return path.read_bytes()
+
+
+CLIP = b"no video, but nothing here reads it" * 40
+HOSTILE: Mapping[str, tuple[str, Callable[[Path], bytes], Mapping[str, str]]] = {
+    "not a tar": (".tar", lambda path: CLIP, {"x.tar": archives.CUT}),
+    "not a zip": (".zip", lambda path: CLIP, {"x.zip": archives.CUT}),
+    "empty": (".tar", lambda path: b"", {"x.tar": archives.CUT}),
+    "cut in a member": (".tar", lambda path: tar_of(path, ("a.mp4", CLIP))[:1000], {"x.tar": archives.CUT}),
+    "cut behind a member": (".tar", lambda path: tar_of(path, ("a.mp4", CLIP))[:2048], {"x.tar": archives.CUT}),
+    "cut zip": (".zip", lambda path: zip_of(path, ("a.mp4", CLIP))[:-9], {"x.zip": archives.CUT}),
+    "zip without its head": (
+        ".zip",
+        lambda path: b"x" * 20 + zip_of(path, ("a.mp4", CLIP))[20:],
+        {"x/a.mp4": "lies beyond the end"},
+    ),
+    "joined": (".tar", lambda path: 2 * tar_of(path, ("a.mp4", CLIP)), {"x.tar": "has bytes behind its end mark"}),
+    "damaged header": (
+        ".tar",
+        lambda path: tar_of(path, ("a.mp4", CLIP), ("b.mp4", CLIP)).replace(b"b.mp4", b"c.mp4"),
+        {"x.tar": archives.CUT},
+    ),
+    "names that lead out": (
+        ".tar",
+        lambda path: tar_of(path, ("../a.mp4", CLIP), ("/b.mp4", CLIP), ("x/../../c.mp4", CLIP), ("../d.txt", CLIP)),
+        {"x/../a.mp4": archives.LEAVES, "x//b.mp4": archives.LEAVES, "x/x/../../c.mp4": archives.LEAVES},
+    ),
+    "zip names that lead out": (
+        ".zip",
+        lambda path: zip_of(path, ("../a.mp4", CLIP), ("/b.mp4", CLIP)),
+        {"x/../a.mp4": archives.LEAVES, "x//b.mp4": archives.LEAVES},
+    ),
+    "a name that steers a terminal": (
+        ".tar",
+        lambda path: tar_of(path, ("\x1b[31m.mp4", CLIP)),
+        {r"x/\x1b[31m.mp4": "not UTF-8"},
+    ),
+    "a long name": (
+        ".tar",
+        lambda path: tar_of(path, ("a" * 2000 + ".mp4", CLIP)),
+        {"x.tar": "has a name of 2004 characters"},
+    ),
+    "a link": (
+        ".tar",
+        lambda path: tar_of(path, ("a.mp4", b""), type=tarfile.SYMTYPE, linkname="/etc/passwd"),
+        {"x/a.mp4": "is a link"},
+    ),
+    "a device": (
+        ".tar",
+        lambda path: tar_of(path, ("a.mp4", b""), type=tarfile.CHRTYPE),
+        {"x/a.mp4": "is a link, or no regular file"},
+    ),
+    "sparse": (
+        ".tar",
+        lambda path: tar_of(path, ("a.mp4", CLIP), pax_headers={}, type=tarfile.GNUTYPE_SPARSE),
+        {"x/a.mp4": "is sparse"},
+    ),
+    "compressed": (
+        ".zip",
+        lambda path: zip_of(path, ("a.mp4", CLIP), ("a.txt", CLIP), ("b.mp4", CLIP), method=ZIP_DEFLATED),
+        {"x/a.mp4": "is compressed", "x/b.mp4": "is compressed"},
+    ),
+    "a file that is a folder": (
+        ".tar",
+        lambda path: tar_of(path, ("a.mp4", CLIP), ("a.mp4/b.mp4", CLIP)),
+        {"x/a.mp4": "is both a file and a folder"},
+    ),
+    "hidden": (".tar", lambda path: tar_of(path, ("._a.mp4", CLIP), (".b/c.mp4", CLIP)), {}),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_what_cannot_be_read_in_place_is_refused_in_words(case: str, tmp_path: Path) -> None:
+    """Alone: the video beside it is served."""
+    ending, make, expected = HOSTILE[case]
+    corpus = tmp_path / "corpus"
+    write_clip(corpus / "good.mp4", panned_luma(24, 32, 40))
+    data = make(tmp_path / f"x{ending}")
+    (corpus / f"x{ending}").write_bytes(data)
+    with opened(corpus, tmp_path) as catalogue:
+        assert list(catalogue.videos.ids) == ["good.mp4"]
+        refused = {each.video: each.reason for each in catalogue.refusals}
+    if case == "a file that is a folder":
+        del refused["x/a.mp4/b.mp4"]  # is read, and is no video
+    assert refused.keys() == expected.keys()
+    for id, reason in expected.items():
+        assert reason in refused[id]
+
+
+def test_of_a_name_that_is_there_twice_the_last_counts(tmp_path: Path) -> None:
+    clips = [write_clip(tmp_path / f"{n}.mp4", panned_luma(n, 32, 40)).read_bytes() for n in (24, 30)]
+    (tmp_path / "corpus").mkdir()
+    tar_of(tmp_path / "corpus" / "x.tar", *(("a.mp4", data) for data in clips))
+    said = list[str]()
+    with opened(
+        tmp_path / "corpus", tmp_path, notice=lambda text, is_urgent=False: said.append(text * is_urgent)
+    ) as catalogue:
+        assert [video.frames for video in catalogue.videos] == [30]
+    assert "x.tar: a.mp4 is there more than once: the last one counts, as when it is unpacked" in said
+
+
+@pytest.mark.parametrize(
+    ("names", "text"),
+    [
+        (["a.tar.gz", "b.tgz"], "2 files left out: compressed tar archives cannot be read in place: decompress them"),
+        (
+            ["O_part7_partaa", "O_part7_partab"],
+            "2 files left out: parts of a split archive: join them, with cat O_part7_part* > O_part7.zip",
+        ),
+        (["a.zip.001", "a.zip.002"], "2 files left out: parts of a split archive: join them, with cat a.zip.* > a.zip"),
+        (["a.z01"], "1 file left out: parts of a split archive: join them, with zip -s 0 a.zip --out whole.zip"),
+        (["a.parquet"], "1 file left out: videos in parquet are not read"),
+    ],
+)
+def test_other_archives_are_left_out_in_words(names: list[str], text: str, tmp_path: Path) -> None:
+    corpus = tmp_path / "corpus"
+    corpus.mkdir()
+    for name in names:
+        (corpus / name).touch()
+    with pytest.raises(CorpusError, match=re.escape(text)):
+        open_catalogue(corpus, cache_dir=tmp_path, processes=0)
+    write_clip(corpus / "a.mp4", panned_luma(24, 32, 40))
+    with opened(corpus, tmp_path) as catalogue:
+        assert (text in catalogue.left_out) is (names != ["a.parquet"])
+
+
+@pytest.mark.parametrize(
+    ("names", "places"),
+    [(("a",), [[5, 96]]), (("a",), [[-1, 0]]), (("../a",), [[1, 0]]), (("a\x1b",), [[1, 0]]), (("a", "b"), [[1, 0]])],
+)
+def test_a_table_that_a_hijacked_process_made_up_is_refused(names: tuple[str, ...], places: list[list[int]]) -> None:
+    table = archives.ArchiveTable(names, np.array(places), (), ())
+    with pytest.raises(ValueError, match="its table"):
+        archives.ArchiveTable.from_bytes(table.to_bytes(), 100)
+
+
+def _packed(write: Callable[..., bytes]) -> bytes:
+    with TemporaryDirectory() as folder:
+        return write(Path(folder) / "x", ("a.mp4", CLIP[:600]), ("b.txt", b"x"), ("b.mp4", CLIP[:300]))
+
+
+_TAR, _ZIP = _packed(tar_of), _packed(zip_of)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.data())
+def test_no_change_of_bytes_ends_the_reading_of_an_archive_otherwise(data: st.DataObject) -> None:
+    ending, content = data.draw(st.sampled_from([(".tar", _TAR), (".zip", _ZIP)]))
+    changed = bytearray(content)
+    for at, value in data.draw(st.lists(st.tuples(st.integers(0, len(content) - 1), st.integers(0, 255)), max_size=5)):
+        changed[at] = value
+    del changed[data.draw(st.integers(0, len(content))) :]
+    try:
+        table = archives.read_table(io.BytesIO(changed), f"x{ending}", lambda name: name.endswith(".mp4"))
+    except ValueError:
+        return
+    archives.ArchiveTable.from_bytes(table.to_bytes(), len(changed))
+
+
+def test_a_store_is_prepared_from_archives_as_from_a_folder(forms: Mapping[str, Path], tmp_path: Path) -> None:
+    made = {}
+    for form, folder in forms.items():
+        out = tmp_path / "out" / form / "store"
+        with opened(folder, tmp_path) as catalogue:
+            report = prepare(catalogue, out, processes=int(form == "tar"))
+            assert len(report.failed) == 0
+            assert prepare(catalogue, out, processes=0).kept == len(catalogue.videos)
+        files = {
+            path.relative_to(out): path.read_bytes()
+            for path in out.rglob("*")
+            if path.is_file() and path.name[0] != "."
+        }
+        (manifest,) = [name for name in files if name.name == MANIFEST_NAME]
+        lines = files.pop(manifest).splitlines()
+        made[form] = files, sorted(lines[1:])
+    assert made["folder"] == made["tar"] == made["zip"]
