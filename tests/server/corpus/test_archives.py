@@ -82,8 +82,14 @@ def reference(plain: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[An
 
 @pytest.mark.parametrize("form", ["tar", "zip"])
 def test_an_archive_is_the_folder_that_it_unpacks_to(
-    forms: Mapping[str, Path], reference: tuple[Any, ...], tmp_path: Path, form: str
+    forms: Mapping[str, Path],
+    reference: tuple[Any, ...],
+    tmp_path: Path,
+    form: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """Only a confined process parses an archive."""
+    monkeypatch.setattr("v2v_server.corpus.sources.folder.read_table", pytest.fail)
     with opened(forms[form], tmp_path, processes=1) as catalogue:
         assert snapshot(catalogue) == reference
         assert (len(reference[0]), len(reference[2])) == (len(FORMS) + 1, 1)
@@ -136,6 +142,25 @@ def test_an_archive_that_changed_is_probed_again(plain: Path, tmp_path: Path) ->
     write_clip(corpus / "a.mp4", panned_luma(24, 32, 40))
     with opened(corpus, tmp_path) as catalogue:
         assert list(catalogue.videos.ids) == ["a.mp4"]
+
+
+def test_an_archive_of_other_times_is_read_whole_and_another_place_is_no_video(
+    plain: Path, reference: tuple[Any, ...], tmp_path: Path
+) -> None:
+    """As on a host with a copy of the corpus."""
+    corpus = tmp_path / "corpus"
+    for below in sorted(plain.iterdir()):
+        pack(below, corpus / f"{below.name}.tar")
+    with opened(corpus, tmp_path) as catalogue:
+        for archive in corpus.iterdir():
+            os.utime(archive, (1e9, 1e9))
+        assert snapshot(catalogue) == reference
+        for below in sorted(plain.iterdir()):
+            shutil.copytree(below, tmp_path / below.name)
+            (tmp_path / below.name / "0.txt").write_text("moves all that follows" * 100)
+            pack(tmp_path / below.name, corpus / f"{below.name}.tar")
+        with pytest.raises(VideoChanged):
+            samples_of(catalogue, ROW)
 
 
 def test_an_archive_alone_and_lists_of_archives_and_members(
