@@ -75,7 +75,7 @@ def make_up(clip: Path, folder: Path, cache: Path, videos: int, scene: bool = Fa
             (folder / id).parent.mkdir(parents=True)
         (folder / id).hardlink_to(copy)
         ids.append(id)
-    known = probe_file(Folder(folder), ids[0])
+    known = probe_file(Folder(folder), (ids[0], ()))
     if known.problem is not None:
         raise UsageError(f"--clip {clip}: {known.problem}")
     store = Store(index_path(folder.resolve(), cache))

@@ -128,14 +128,14 @@ def _catalogue_shard(arguments: argparse.Namespace, shard: Shard, probed: _Probe
     corpus = list_corpus(source, Rows.parse(arguments.rows or "full"), probed.notice)
     ids = [id for id in corpus.ids if shard.holds(id)]
     scenes = SceneCollection(corpus.rows) if arguments.scene != "off" else None
-    index = index_path(source.name, arguments.cache_dir, shard)
-    store, table, notes = refresh_index(source, ids, index, scenes, arguments.workers, probed, probed.notice)
+    index, refused = index_path(source.name, arguments.cache_dir, shard), dict[str, str]()
+    store, table, notes = refresh_index(source, ids, index, scenes, arguments.workers, probed, probed.notice, refused)
     store.close()
     if notes:
         raise CorpusError(notes[0])
     problems = Counter(problem for problem in table.problem if problem is not None)
-    path, usable = write_part(index, out, shard), len(ids) - problems.total()
-    lines = [f"shard {shard}: {len(ids)} of {len(corpus.ids)} videos, {usable} can be used"]
+    path, usable = write_part(index, out, shard), len(table) - problems.total()
+    lines = [f"shard {shard}: {len(ids)} of {len(corpus.ids)} videos and archives, {usable} videos can be used"]
     return [*lines, *(f"  {count}: {reason}" for reason, count in problems.most_common(_SHOWN)), f"part: {path}"]
 
 

@@ -25,6 +25,7 @@ from v2v_protocol.messages import Lease
 from v2v_protocol.sample import ARRAYS, Refusal, RefusalKind, sidecar_endings
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.index import SCHEMA_VERSION, FigureKind, Shard, Store
+from v2v_server.corpus.members import list_members
 from v2v_server.corpus.probe import (
     SceneCollection,
     VideoProgress,
@@ -44,7 +45,7 @@ from v2v_server.corpus.sources.listing import (
     left_out_note,
     silent,
 )
-from v2v_server.corpus.sources.prepared import ABSENT, Header, Manifest, manifest_of, prepared_name, rows_of
+from v2v_server.corpus.sources.prepared import ABSENT, Header, Manifest, manifest_of, rows_of
 from v2v_server.corpus.sources.sidecars import sidecar_id
 from v2v_server.corpus.sources.source import (
     COPIES_GIB,
@@ -93,7 +94,7 @@ class Corpus:
     Attributes:
         source: where the videos come from.
         rows: which rows of the pictures may be used.
-        ids: of the files that may be videos.
+        ids: of the files that may be videos, and of archives that may hold some.
         refused: files, folders and lines of the list that give no video, by id, with reasons.
         left_out: reports files of other endings; "" if there are none.
     """
@@ -128,13 +129,15 @@ def list_corpus(source: VideoSource, rows: Rows | None, notice: Notice) -> Corpu
             ids.append(id)
         if is_said(len(ids)):
             notice(f"looking for videos in {source}: {len(ids)} so far")
-    note = left_out_note(left_out)
+    note = left_out_note(left_out, has_videos=bool(ids))
     if not ids:
-        raise CorpusError(
-            f"{source}: no video found; looked for {source.kind.looked_for}"
-            f"{format_problems(refused)}{note and '. '}{note}"
-        )
+        raise _no_video(source, refused, note)
     return Corpus(source, rows, tuple(ids), refused, note)
+
+
+def _no_video(source: VideoSource, refused: Mapping[str, str], note: str = "") -> CorpusError:
+    looked_for, problems = source.kind.looked_for, format_problems(refused)
+    return CorpusError(f"{source}: no video found; looked for {looked_for}{problems}{note and '. '}{note}")
 
 
 def index_path(
@@ -162,6 +165,7 @@ def refresh_index(
     processes: int,
     progress: VideoProgress,
     notice: Notice,
+    refused: dict[str, str],
 ) -> tuple[Store, VideoTable, list[str]]:
     """Return an open index that knows every id, its table, and notes for the user.
 
@@ -169,14 +173,16 @@ def refresh_index(
 
     Args:
         source: where the videos come from.
-        ids: of the videos to know.
+        ids: of the videos to know, and of archives of them.
         path: of the index.
         scenes: how to analyse what the videos show; None does not.
         processes, progress, notice: as in :func:`v2v_server.corpus.catalogue.open_catalogue`.
+        refused: receives, by id, why an archive or a member is refused.
+
     """
     ids = [id for id, _ in groupby(sorted(ids))]  # a list may name a video twice
     try:
-        store, table = _refreshed(path, source, ids, scenes, processes, progress, notice)
+        store, table = _refreshed(path, source, ids, scenes, processes, progress, notice, refused)
     except (sqlite3.Error, OSError, UnicodeDecodeError) as error:
         note = (
             f"the catalogue's index {path} cannot be used ({error}); this start keeps it in memory, and the next one "
@@ -185,7 +191,7 @@ def refresh_index(
         )
         if "locked" in str(error):  # the outcome of a wait that was said
             notice(f"the catalogue's index {path} cannot be used ({error}): probing every video again", is_urgent=True)
-        return *_refreshed(None, source, ids, scenes, processes, progress, notice), [note]
+        return *_refreshed(None, source, ids, scenes, processes, progress, notice, refused), [note]
     if store.replaced_version is None:
         return store, table, []
     note = (
@@ -203,9 +209,11 @@ def _refreshed(
     processes: int,
     progress: VideoProgress,
     notice: Notice,
+    refused: dict[str, str],
 ) -> tuple[Store, VideoTable]:
     store = Store(path, notice)
     try:
+        ids = sorted(list_members(source, store, ids, processes, notice, refused))
         kind = None if scenes is None else scenes.kind
         if kind is not None:
             store.make_figures()
@@ -319,13 +327,14 @@ class Catalogue:
         return self.source.folder
 
     def path(self, id: str) -> Path:
-        """Return where the video lies.
+        """Return where the video lies; of a member of an archive, what a FileRange is as a path.
 
         Raises:
             CorpusError: there is no such id in this catalogue, or no such folder on this host.
         """
-        self._fingerprint(id)
-        return self.folder / (id if self.prepared is None else prepared_name(id))
+        self.source.expected = id, self.state(id) or ()
+        with self.folder and self.source.open_local(id, "") as path:
+            return Path(os.fspath(path))
 
     def check(self, id: str, fingerprint: str, sidecar: str = "") -> None:
         """Check that the video is as catalogued, or its sidecar of that ending, see :meth:`VideoSource.verify`.
@@ -344,7 +353,9 @@ class Catalogue:
         Raises:
             VideoChanged, VideoUnreadable: they are not the catalogued ones, or cannot be told.
         """
-        if self.source.is_local and self.source.state(id) != self.state(id):
+        known = self.state(id)
+        self.source.expected = id, known or ()
+        if self.source.is_local and self.source.state(id) != known:
             raise VideoChanged(id, None, CHANGED)
 
     def state(self, id: str) -> FileState | None:
@@ -567,10 +578,14 @@ def open_catalogue(
     corpus = list_corpus(opened, rows, notice)
     scenes = SceneCollection(corpus.rows) if scene else None
     path = index_path(opened.name, cache_dir)
-    store, table, notes = refresh_index(opened, corpus.ids, path, scenes, processes, progress, notice)
+    refused = dict(corpus.refused)
+    store, table, notes = refresh_index(opened, corpus.ids, path, scenes, processes, progress, notice, refused)
+    corpus = replace(corpus, refused=refused)
     try:
         with without_collections():
-            return _snapshot(corpus, table, notes, store, scenes, processes, notice)
+            catalogue = _snapshot(corpus, table, notes, store, scenes, processes, notice)
+        opened.members, opened.tables = {}, {}  # from now on the index has their states
+        return catalogue
     except BaseException as error:
         store.close()
         if isinstance(error, sqlite3.Error):
@@ -600,6 +615,8 @@ def _snapshot(
     table = table.where(usable)
     thresholds, shorter = _listed(source.listed() or (), Videos(table, {}))
     videos = Videos(table, thresholds)
+    if not videos and not len(on_disk):
+        raise _no_video(source, problems, corpus.left_out)
     if not videos:
         raise CorpusError(f"{source}: none of {len(problems)} videos can be used{format_problems(problems)}")
     lacking = {} if manifest is None else {id: manifest.videos[id].problem or _NO_FILE for id in sorted(absent)}

@@ -59,17 +59,20 @@ _MOST_TOGETHER = 1024
 _MOST_SECONDS = 10.0
 VideoProgress = Callable[[int, int], None]
 """(files done so far, files to do)."""
-ProbeFile = Callable[[VideoSource, str], IndexRow]
-"""(source, id) -> what is known of that file; see :func:`probe_file`."""
+ProbeJob = tuple[str, tuple[int, ...]]
+"""Id of a video, and the state of a member of an archive; empty for a file."""
+ProbeFile = Callable[[VideoSource, ProbeJob], IndexRow]
+"""(source, job) -> what is known of that file; see :func:`probe_file`."""
 T = TypeVar("T")
 
 
-def probe_file(source: VideoSource, id: str) -> IndexRow:
+def probe_file(source: VideoSource, job: ProbeJob) -> IndexRow:
     """Probe one file; an error becomes the record's ``problem``.
 
     A file that cannot be read gets the size -1, which no file has: it is probed again at the next start.
     """
-    kind, owner = source.kind, kind_of(id)
+    id, kind = job[0], source.kind
+    owner, source.expected = kind_of(id), job if job[1] else ("", ())
     if owner.unprepared and owner.name != kind.name:  # what can be prepared may be a store, which needs no flag
         return IndexRow(id, -1, problem=f"is {owner.help}: add --videos-kind {owner.name}")
     try:
@@ -150,13 +153,13 @@ def probe_files(
     """
     results = run_twice(
         partial(probe, source),
-        ids,
+        ((id, source.members.get(id, ())) for id in ids),
         processes,
-        deadline_seconds=lambda id: longest_seconds,
+        deadline_seconds=lambda job: longest_seconds,
         memory_bytes=LARGEST_PROBE_BYTES,
         writable=() if source.is_local else None,  # copies are fetched: from a network, into a folder
     )
-    for id, found in results:
+    for (id, _), found in results:
         yield _culprit(source, id, found) if isinstance(found, Died) else replace(found, id=id)
 
 
@@ -168,7 +171,7 @@ def _culprit(source: VideoSource, id: str, death: Died) -> IndexRow:
         return IndexRow(id, -1, problem=f"{why}; the next start tries again")
     why = f"crashes the decoder: the process that probed it died ({death.how})"
     try:
-        return IndexRow(id, *source.state(id), problem=why)
+        return IndexRow(id, *(source.members.get(id) or source.state(id)), problem=why)
     except VideoUnreadable:
         return IndexRow(id, -1, problem=why)  # gone meanwhile; if it comes back, it is probed again
 
@@ -292,7 +295,8 @@ class SceneCollection:
         def jobs() -> Iterator[_SceneJob]:
             for record in map(table.row, left):
                 index = store.frame_index(record.id, record.fingerprint) or b""
-                yield _SceneJob(record.id, record.fingerprint, record.frames, index, self._window(record))
+                place = source.members.get(record.id, ())
+                yield _SceneJob(record.id, record.fingerprint, record.frames, index, self._window(record), place)
 
         results = run_twice(
             partial(_analyse, source),
@@ -337,6 +341,7 @@ class _SceneJob(Persisted):
     frames: int
     index: bytes
     window: PixelRect | None
+    place: tuple[int, ...]
 
 
 def _analyse(source: VideoSource, job: _SceneJob) -> Scene | None:
@@ -347,7 +352,7 @@ def _analyse(source: VideoSource, job: _SceneJob) -> Scene | None:
     # Import lazily: processes that only open a catalogue need no OpenCV.
     from v2v_server.corpus.scenes.analysis import SceneAnalysis
 
-    analysis = SceneAnalysis()
+    analysis, source.expected = SceneAnalysis(), (job.id, job.place) if job.place else ("", ())
     if job.index and job.window is not None:
         try:
             with source.open_pixels(job.id, job.fingerprint) as pixels:

@@ -44,6 +44,7 @@ class VideosKind:
         help: what a video is, after "is".
         forms: files of ``v2v_server/store/`` that read a video, in the order in which they are asked.
         endings: of the ids of its videos, in lower case; no two kinds have one in common.
+        archive_endings: of archives whose members may be videos, in lower case.
         looked_for: which files are videos, for messages.
         has_parts: whether a video may be a folder of files, whose id ends with a slash.
         has_listed_rates: whether a list may state the rate of a video.
@@ -64,6 +65,7 @@ class VideosKind:
     help: ClassVar[str]
     forms: ClassVar[Sequence[str]]
     endings: ClassVar[tuple[str, ...]]
+    archive_endings: ClassVar[tuple[str, ...]] = ()
     looked_for: ClassVar[str]
     has_parts: ClassVar[bool] = False
     has_listed_rates: ClassVar[bool] = False

@@ -20,9 +20,10 @@ class VideoKind(VideosKind):
     help = "a file"
     forms = "store_file", "video_file"
     endings = VIDEO_SUFFIXES
+    archive_endings = ".tar", ".zip"
     looked_for = (
-        f"{' '.join(VIDEO_SUFFIXES)}; with --videos-kind sequences, folders of numbered pictures are videos, "
-        "and with --videos-kind photographs, each picture is a scene that moves"
+        f"{' '.join(VIDEO_SUFFIXES)}, also in .tar and .zip archives; with --videos-kind sequences, folders of "
+        "numbered pictures are videos, and with --videos-kind photographs, each picture is a scene that moves"
     )
     seeks_by_time = True
 

@@ -39,6 +39,7 @@ from v2v_server.store.planes import PLANES
 from v2v_server.store.planes.plane import PlanePlace, pack_footer, read_footer
 from v2v_server.system.process import make_private
 from v2v_server.video.decode import ClipRequest, DecodedClip, DecodedPicture
+from v2v_server.video.file_range import FileRange, open_bytes
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.picture import MIXED, SDR, PixelRect, Signal
 from v2v_server.video.probe import VideoFacts
@@ -396,10 +397,9 @@ def open_pixels(path: Path) -> StoreFile | None:
 def is_store_file(path: str | os.PathLike[str]) -> bool:
     """Return whether a file begins like a store file; False if it cannot be read."""
     try:
-        # Opening a FIFO without O_NONBLOCK would block until there is a writer.
-        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
-            return file.read(len(MAGIC)) == MAGIC
-    except OSError:
+        with open_bytes(path) as file:
+            return FileRange.parse(path) is None and file.read(len(MAGIC)) == MAGIC
+    except (OSError, VideoUnreadable):
         return False
 
 

@@ -9,5 +9,6 @@ picture      what the samples of a decoded picture mean: luma, colour, orientati
 picture_file one picture in a file: its head, its decoder, a check of what that delivers
 levels       limited range to full range; red, green and blue from grey and colour: compiled
 rows         which rows may be used
+file_range   a part of a file that is a file itself
 fingerprint  which file it is
 """

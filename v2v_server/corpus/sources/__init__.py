@@ -1,6 +1,7 @@
 """Where the videos of a corpus come from: one file for each kind of source, named in ``source.SOURCE_KINDS``.
 
 source       what every source can do
+archives     tar and zip files whose members are videos where they lie
 folder       a folder, a video or a list file on this host
 prepared     a folder that v2v-prepare made, and its manifest
 copies       an address in object storage

@@ -276,6 +276,8 @@ class Copies(VideoSource):
                 continue
             if not (id := self.kind.id_of(name)) and self.kind.id_of(name.partition("?")[0]):
                 refused[printable(name)] = "is a link with a query, which is not followed: link to the file itself"
+            elif name.endswith(self.kind.archive_endings):
+                left_out["archives in object storage are not read: copy them to a disk of this host"] += 1
             elif not id:
                 count_left_out(parts[-1], left_out)
             elif printable(name) != name:

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
-from functools import partial
+from functools import lru_cache, partial
 from itertools import chain
 from operator import attrgetter
 from pathlib import Path, PurePosixPath
+from typing import cast
 
-from v2v_protocol.errors import CorpusError, VideoError
+from v2v_protocol.errors import CorpusError, VideoChanged, VideoError
 from v2v_protocol.programs import printable
 from v2v_protocol.write_aside import OUTPUT_MARKER
+from v2v_server.corpus.sources.archives import ArchiveTable, MemberPath, archive_mark, find_archive, read_table
 from v2v_server.corpus.sources.listing import LIST_SUFFIXES, ListEntry, answers, count_left_out, read_list
 from v2v_server.corpus.sources.sidecars import check_local, is_sidecar, local_state, sidecar_id, state_of_parts
 from v2v_server.corpus.sources.source import (
@@ -31,7 +34,8 @@ from v2v_server.kinds.kind import VideosKind
 from v2v_server.kinds.registry import VIDEOS
 from v2v_server.store.pixels import Pixels
 from v2v_server.store.verified import KnownState, Verified
-from v2v_server.video.fingerprint import check_fingerprint, files_in, unreadable
+from v2v_server.video.file_range import FileRange, open_bytes
+from v2v_server.video.fingerprint import CHANGED, check_fingerprint, files_in, unreadable
 
 PSEUDO_FILE_SYSTEMS = frozenset({
     "binfmt_misc", "bpf", "cgroup", "cgroup2", "configfs", "debugfs", "devpts", "devtmpfs", "efivarfs", "fusectl",
@@ -83,10 +87,88 @@ class Folder(VideoSource):
         try:
             if path.endswith("/"):
                 return state_of_parts(self, id, [(name, _numbers(status)) for name, status in files_in(path)])
-            size, modified, changed = _numbers(status := os.stat(path))
+            try:
+                status = os.stat(path)
+            except (FileNotFoundError, NotADirectoryError):
+                if (member := self._member_state(id)) is None:
+                    raise
+                return member
+            size, modified, changed = _numbers(status)
         except OSError as error:
             raise unreadable(id, error) from error
         return (size, modified, changed ^ mark_of(self, id)) if stat.S_ISREG(status.st_mode) else GONE
+
+    def archive_of(self, id: str) -> str:
+        """Return the archive that the id of a member leads into, below the folder; "" if it leads into none."""
+        at, endings = f"{self.name}/", self.kind.archive_endings
+        return find_archive(id, endings, lambda path: os.path.isdir(at + path), lambda path: os.path.isfile(at + path))
+
+    def _member_state(self, id: str) -> FileState | None:
+        """Return the state of a member of an archive; None if the id leads into none.
+
+        Raises:
+            OSError: the archive had no such member when it was listed, or this process was not told where it lies.
+        """
+        if not (archive := self.archive_of(id)):
+            return None
+        if not (place := self._place(id)):
+            raise OSError(errno.ENOENT if self.members else errno.EAGAIN, f"its place in {archive} is not known")
+        return place[0], place[1], self._mark(archive) ^ mark_of(self, id)
+
+    def _mark(self, archive: str) -> int:
+        return archive_mark(archive, _numbers(os.stat(f"{self.name}/{archive}")))
+
+    def _place(self, id: str) -> Sequence[int]:
+        """Return size and first byte of a member in its archive, as this process was told; nothing if it was not."""
+        return self.members.get(id) or (self.expected[1] if self.expected[0] == id else ())
+
+    def _file(self, id: str) -> Path:
+        """Return a video's file, or the part of an archive that is one.
+
+        Raises:
+            VideoUnreadable: the archive has no such member, or cannot be read.
+        """
+        path = self.path_of(id)
+        if os.path.lexists(path) or not (archive := self.archive_of(id)):
+            return Path(path)
+        try:
+            size, start = (self._place(id) or self._table(archive).place(_name_in(archive, id)))[:2]
+        except OSError as error:
+            raise unreadable(id, error) from error
+        return cast(Path, FileRange(f"{self.name}/{archive}", start, start + size))
+
+    def _sidecar(self, id: str) -> Path:
+        """Return where a sidecar lies, or would lie.
+
+        Raises:
+            VideoUnreadable: its archive cannot be read.
+        """
+        path = self.folder / id
+        if os.path.lexists(path) or not (archive := self.archive_of(id)):
+            return path
+        try:
+            mark, table = self._mark(archive), self._table(archive)
+            return cast(Path, MemberPath(f"{self.name}/{archive}", mark, _name_in(archive, id), table))  # type: ignore[abstract]
+        except OSError as error:
+            raise unreadable(id, error) from error
+
+    def _table(self, archive: str) -> ArchiveTable:
+        """Return the table of an archive; a process that was not told where a member lies reads it once.
+
+        Raises:
+            OSError: it cannot be read, or is no archive.
+        """
+        try:
+            if (table := self.tables.get(archive)) is None:
+                table = _read_once(self, archive, _numbers(os.stat(f"{self.name}/{archive}")))
+            return table
+        except ValueError as error:
+            raise OSError(errno.EIO, str(error)) from error
+
+    def read_table(self, archive: str) -> bytes:
+        """Read the table of an archive, see :class:`HasArchives`."""
+        with open_bytes(f"{self.name}/{archive}") as file:
+            return read_table(file, archive, self.kind.id_of).to_bytes()
 
     def open_local(self, id: str, fingerprint: str) -> AbstractContextManager[Path]:
         """Lend the file; only a sidecar of one file is checked.
@@ -94,9 +176,12 @@ class Folder(VideoSource):
         Raises:
             VideoUnreadable, VideoChanged: a sidecar cannot be read, or is another one by now.
         """
-        if fingerprint and is_sidecar(id) and not id.endswith("/"):
-            check_local(self.folder / id, id, fingerprint)
-        return nullcontext(self.folder / id if is_sidecar(id) else Path(self.path_of(id)))
+        if not is_sidecar(id):
+            return nullcontext(self._file(id))
+        path = self._sidecar(id)
+        if fingerprint and not id.endswith("/"):
+            check_local(path, id, fingerprint)
+        return nullcontext(path)
 
     @contextmanager
     def open_pixels(self, id: str, fingerprint: str) -> Iterator[Pixels]:
@@ -104,7 +189,7 @@ class Folder(VideoSource):
         (:mod:`v2v_server.store.verified`).
         """
         with super().open_pixels(id, fingerprint) as pixels:
-            path, expected = self.path_of(id), partial(is_expected, self, id)
+            path, expected = os.fspath(self._file(id)), partial(is_expected, self, id)
             yield pixels if pixels.is_stored else Verified(pixels, path, self._known, expected)
 
     def has(self, files: Mapping[str, str]) -> bool:
@@ -137,7 +222,7 @@ class Folder(VideoSource):
         for id in ids:
             below = id.rstrip("/").rpartition("/")[0]
             if below not in names:
-                names[below] = _names_with(self.folder / below, endings)
+                names[below] = _names_with(self._sidecar(f"{below}/" if below else ""), endings)
             there = names[below]
             if there is not None and not there:
                 continue
@@ -149,7 +234,11 @@ class Folder(VideoSource):
     def sidecar_state(self, id: str) -> str | OSError:
         """Return a text that stands for sizes and times, see :meth:`VideoSource.sidecar_state`."""
         try:
-            return local_state(self.folder / id, id)
+            path = self._sidecar(id)
+            state = local_state(path, id)
+            return f"{path.mark:x} {state}" if state and isinstance(path, MemberPath) else state
+        except VideoError as error:
+            return OSError(error.reason)
         except OSError as error:
             return error
 
@@ -160,32 +249,38 @@ class Folder(VideoSource):
             VideoError: it is gone, another one by now, or cannot be read.
         """
         if is_sidecar(id):
-            check_local(self.folder / id, id, fingerprint, str(state or ""))
+            if os.path.lexists(self.path_of(id)) or not (archive := self.archive_of(id)):
+                check_local(self.folder / id, id, fingerprint, str(state or ""))
+            elif not str(state or "").startswith(f"{self._mark(archive):x} " if state else ""):
+                raise VideoChanged(id, None, f"{CHANGED}: {archive} is another file")
         elif os.path.isdir(path := self.path_of(id)):  # not as a worker has listed it
             check_fingerprint(path, fingerprint)
         else:
+            if state is None and self.archive_of(id):
+                return  # its place is not known, and this process parses no archive
+            self.expected = id, state if isinstance(state, tuple) else ()
             with super().open_pixels(id, fingerprint) as pixels:
                 pixels.check(fingerprint)
 
     def _regular_files(self, refused: dict[str, str]) -> Iterator[str]:
-        """Yield the listed ids that do not name something else than a file.
+        """Yield the listed ids that do not name something else than a file; instead of members, their archives.
 
         Opening a FIFO blocks until there is a writer, and reading a device may never end. An id that names nothing is
         kept: probing it reports why.
         """
         pseudo = pseudo_devices()
 
-        def may_be_read(id: str) -> bool:
+        def file_to_read(id: str) -> str:
             try:
                 status = os.stat(os.path.join(self.name, id))
             except OSError:
-                return True
+                return self.archive_of(id) or id
             wanted = stat.S_IFDIR if id.endswith("/") else stat.S_IFREG
-            return stat.S_IFMT(status.st_mode) == wanted and status.st_dev not in pseudo
+            return id * (stat.S_IFMT(status.st_mode) == wanted and status.st_dev not in pseudo)
 
-        for id, is_regular in answers(may_be_read, [entry.id for entry in self.listed() or ()]):
-            if is_regular:
-                yield id
+        for id, file in answers(file_to_read, [entry.id for entry in self.listed() or ()]):
+            if file:
+                yield file
             else:
                 refused[id] = "is not a regular file" if id[-1] != "/" else "is not a folder"
 
@@ -215,6 +310,16 @@ class Folder(VideoSource):
                 )
 
 
+@lru_cache(maxsize=64)
+def _read_once(source: Folder, archive: str, state: FileState) -> ArchiveTable:
+    return ArchiveTable.from_bytes(source.read_table(archive), state[0])
+
+
+def _name_in(archive: str, id: str) -> str:
+    """Return the name in its archive of a member of that id."""
+    return id[len(archive.rpartition(".")[0]) + 1 :].rstrip("/")
+
+
 def _numbers(status: os.stat_result) -> FileState:
     return status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
@@ -223,8 +328,8 @@ def _names_with(folder: Path, endings: Sequence[str]) -> frozenset[str] | None:
     """Return the names in a folder that have one of these endings; None if it cannot be listed."""
     suffixes = tuple(ending.rstrip("/") for ending in endings)
     try:
-        with os.scandir(folder) as listing:
-            return frozenset(entry.name for entry in listing if entry.name.endswith(suffixes))
+        names = os.listdir(folder) if isinstance(folder, Path) else (entry.name for entry in folder.iterdir())
+        return frozenset(name for name in names if name.endswith(suffixes))
     except OSError:
         return None
 
@@ -268,7 +373,8 @@ def locate(name: str, options: SourceOptions) -> tuple[Path, Callable[[], tuple[
 def video_files(
     root: Path, refused: dict[str, str], left_out: Counter[str], kind: VideosKind = VIDEOS
 ) -> Iterator[str]:
-    """Return relative POSIX paths of the video files below ``root``, known by their suffixes.
+    """Return relative POSIX paths of the video files below ``root``, known by their suffixes, and of archives that may
+    hold some. An archive beside a folder or an archive of its name without the ending is refused.
 
     Links are followed; a link to a folder that it lies in is not. A folder that several links lead to has its videos
     under each path, because each such id is part of the digests of existing corpora. Folders that link to each other
@@ -316,6 +422,7 @@ def video_files(
             refused[name] = f"the folder cannot be read: {error.strerror or error}"
             return
         found: list[str] = []
+        names = {entry.name for entry in entries}
         for entry in entries:
             if entry.name[0] == ".":
                 continue
@@ -332,13 +439,18 @@ def video_files(
                 found = []
                 more = links + entry.is_symlink()
                 yield from below(folder / entry.name, f"{relative}/", above | {identity}, more)
-            elif id := id_of(relative):
+            elif id := id_of(relative) or (relative if relative.endswith(kind.archive_endings) else ""):
+                stem = "" if id_of(relative) else entry.name.rpartition(".")[0]
+                same = [stem + ending for ending in ("", *kind.archive_endings) if stem and stem + ending in names]
                 if printable(relative) != relative:
                     refused[printable(relative)] = UNPRINTABLE
                 elif not is_file:
                     refused[relative] = "is not a regular file, or is a broken link"
                 elif is_pseudo:
                     refused[relative] = PSEUDO
+                elif stem and same != [entry.name]:
+                    other = next(name for name in same if name != entry.name)
+                    refused[relative] = f"would give the same ids as {other} beside it: move one of them away"
                 else:
                     found.append(id)
             elif is_file:

@@ -19,7 +19,7 @@ from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
 from v2v_protocol.errors import CorpusError
-from v2v_protocol.programs import printable
+from v2v_protocol.programs import counted, printable
 from v2v_server.kinds.kind import VideosKind
 from v2v_server.kinds.registry import VIDEOS
 
@@ -32,6 +32,21 @@ _NO_VIDEO_SUFFIXES = frozenset({
     ".tmp", ".toml", ".tsv", ".txt", ".vtt", ".wav", ".webp", ".xlsx", ".xml", ".xz", ".yaml", ".yml", ".zip", ".zst",
 })  # fmt: skip
 _MOST_SUFFIXES_SHOWN = 10
+_UNREAD_ARCHIVES = (
+    (
+        re.compile(r".+\.(tar\.[a-z0-9]+|tgz|tbz2?|txz|tzst)", re.IGNORECASE),
+        "compressed tar archives cannot be read in place: decompress them, with gunzip or zstd -d",
+    ),
+    (
+        re.compile(r"(?P<whole>.+?)(\.zip)?([._-]part[._-]?[a-z]{2}|(?<=\.zip)\.\d{3})"),
+        "parts of a split archive: join them, with cat {prefix}* > {whole}.zip",
+    ),
+    (
+        re.compile(r"(?P<whole>.+)\.z\d\d"),
+        "parts of a split archive: join them, with zip -s 0 {whole}.zip --out whole.zip",
+    ),
+)
+_PARQUET = "videos in parquet are not read: write their values to the members of tar archives"
 
 LIST_SUFFIXES = frozenset({".txt", ".csv", ".lst"})
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE)
@@ -39,18 +54,29 @@ _COLUMNS = "path", "frames", "c+", "c-", "rate"
 
 
 def count_left_out(name: str, left_out: Counter[str]) -> None:
-    """Count a file that may be a video of another ending."""
+    """Count a file that may be a video of another ending, or an archive of videos."""
+    for form, text in _UNREAD_ARCHIVES:
+        if (found := form.fullmatch(name)) is not None:
+            prefix = name[: -2 if name[-1].isalpha() else -3]
+            left_out[printable(text.format(prefix=prefix, **found.groupdict()))] += 1
+            return
+    left_out[_PARQUET] += name.endswith(".parquet")
     stem, _, ending = name.rpartition(".")
     suffix = printable(f".{ending.lower()}")
     if stem and len(suffix) <= 12 and suffix not in _NO_VIDEO_SUFFIXES:
         left_out[suffix] += 1
 
 
-def left_out_note(left_out: Counter[str]) -> str:
-    """Return the line that reports folders of outputs, and files with other endings; "" where there are none."""
+def left_out_note(left_out: Counter[str], has_videos: bool = True) -> str:
+    """Return the line that reports folders of outputs, and files with other endings; "" where there are none. Files of
+    parquet, which may be tables, count where there are no videos.
+    """
+    archives = {text: n for text, n in left_out.items() if n and " " in text and not (has_videos and text == _PARQUET)}
+    left_out = Counter({name: count for name, count in left_out.items() if " " not in name})
     folders = sorted(name for name in left_out if name.endswith("/"))
     endings = sorted(item for item in left_out.items() if not item[0].endswith("/"))
-    lines = []
+    lines = [f"{counted(count, 'file')} left out: {text}" for text, count in sorted(archives.items())]
+    del lines[_MOST_SUFFIXES_SHOWN:]
     if folders:
         lines.append(
             f"{len(folders)} folders that a v2v command wrote were passed over: {_shown(folders)}. Move videos out of "

@@ -21,6 +21,7 @@ from contextlib import contextmanager, nullcontext
 from functools import lru_cache
 from importlib.resources.abc import Traversable
 from pathlib import Path, PurePosixPath
+from typing import cast
 from zipfile import Path as ZipPath
 from zipfile import ZipFile
 
@@ -111,9 +112,9 @@ def local_state(path: Path, id: str) -> str:
         OSError: it cannot be told, or the sidecar is beyond the limits.
     """
     try:
-        if stat.S_ISDIR(os.stat(path).st_mode) != id.endswith("/"):
+        if stat.S_ISDIR(path.stat().st_mode) != id.endswith("/"):
             return ""
-        found = ((name, os.stat(str(file))) for name, file in _files(path))
+        found = ((name, cast(Path, file).stat()) for name, file in _files(path))
         return state_text((name, (each.st_size, each.st_mtime_ns, each.st_ctime_ns)) for name, each in found)
     except (FileNotFoundError, NotADirectoryError):
         return ""

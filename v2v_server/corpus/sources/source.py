@@ -97,7 +97,9 @@ class VideoSource(ABC):
         folder: that ids are relative to; None: they are not files of this host.
         copies: the folder for copies of its files; None without one.
         expected: the id of the video that is opened next, and its catalogued state without :func:`mark_of`. A file or
-            object that is in this state need not be read whole.
+            object that is in this state need not be read whole; that of a member says where it lies in its archive.
+        members: states of the videos in archives, by id, while the corpus is being opened.
+        tables: what its archives hold, by path, for as long (:class:`v2v_server.corpus.sources.archives.ArchiveTable`).
     """
 
     is_local = True
@@ -113,6 +115,8 @@ class VideoSource(ABC):
     ) -> None:
         self.name, self.listed, self.folder = name, cache(listed), folder
         self.rates: dict[str, float] = {}
+        self.members: dict[str, FileState] = {}
+        self.tables: dict[str, Any] = {}
 
     def __str__(self) -> str:
         return self.name
@@ -145,6 +149,9 @@ class VideoSource(ABC):
             refused: receives, by id, why a file, folder or list entry is refused.
             left_out: counts, by suffix, files that may be videos of other endings.
 
+        Yields:
+            ids of videos, and paths of archives that may have videos as members (``kind.archive_endings``).
+
         Raises:
             CorpusError: the source cannot be listed, or cannot be served.
         """
@@ -164,14 +171,15 @@ class VideoSource(ABC):
         found = array("q")
         for id in ids:
             try:
-                found.extend(self.state(id))
+                found.extend(self.members[id] if id in self.members else self.state(id))
             except VideoUnreadable as error:
                 found.extend(GONE if isinstance(error, VideoGone) else NO_STATE)
         return found
 
     @abstractmethod
     def open_local(self, id: str, fingerprint: str) -> AbstractContextManager[Path]:
-        """Lend a file of this host with the bytes of a video or sidecar, until the end of the context.
+        """Lend a file of this host with the bytes of a video or sidecar, until the end of the context. Of a member of
+        an archive it is a FileRange or MemberPath, which is read like a file.
 
         Args:
             fingerprint: as catalogued; "" takes what is there now.
