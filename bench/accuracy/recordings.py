@@ -51,6 +51,7 @@ _COLUMNS: tuple[Column, ...] = (
 _JUDGED: tuple[Column, ...] = (
     ("network", "network", "{}", 1),
     ("data", "data", "{}", 1),
+    ("windows", "windows", "{:.0f}", 1),
     ("lpips", "LPIPS", "{:.3f}", 1),
     ("correlation", "correlation", "{:.3f}", 1),
     ("mse", "squared error", "{:.4f}", 1),
@@ -125,21 +126,22 @@ def judged(asked: argparse.Namespace) -> Report:
     metrics = make_metrics([lpips, "correlation", "mse"], {asked.lpips[0]: tuple(asked.lpips[1:])})
     (worlds,) = learn.held_out(asked.photographs, "photographs", learn.PHOTOGRAPHS, asked.samples).values()
     records: list[Record] = []
+    by_grids: list[Record] = []
     means: dict[str, dict[str, float]] = {}
     for name, network in networks.items():
         progress(f"judging {name}")
-        kinds = {
-            "recordings": rule.on_recordings(
-                asked.out, network, metrics, asked.side**2 // 4, published=name not in candidates
-            ),
-            "worlds": rule.on_worlds(worlds, network, metrics),
-        }
+        recorded, parts = rule.on_recordings(
+            asked.out, network, metrics, asked.side**2 // 4, published=name not in candidates
+        )
+        kinds = {"recordings": recorded, "worlds": rule.on_worlds(worlds, network, metrics)}
         means[name] = rule.mean_of(list(kinds.values()), lpips)
         shown = {kind: rule.mean_of([figures], lpips) for kind, figures in kinds.items()} | {"mean": means[name]}
         records += [{"network": name, "data": kind, **figures} for kind, figures in shown.items()]
+        by_grids += [{"network": name, "data": part, **rule.mean_of([each], lpips)} for part, each in parts.items()]
     verdict = rule.apply({name: means[name] for name in networks if name in candidates})
     lines = [f"{name} is out: {why}" for name, why in verdict.out.items()]
-    return Report(records, [(records, _JUDGED)], [f"ships: {verdict.ships or 'none, all are out'}", *lines])
+    tables = [(records, _JUDGED), (by_grids, _JUDGED)]
+    return Report([*records, *by_grids], tables, [f"ships: {verdict.ships or 'none, all are out'}", *lines])
 
 
 def measure(asked: argparse.Namespace) -> Report:

@@ -11,6 +11,8 @@ Real recordings are reported and decide nothing.
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +22,7 @@ from torch import Tensor
 from bench.accuracy.learn import score
 from trainer.evaluation.config import folder_config
 from trainer.evaluation.evaluate import Run, evaluate_sequence, find_recordings
-from trainer.evaluation.metrics import Metric
+from trainer.evaluation.metrics import GreyImage, Metric
 from trainer.evaluation.score import mean_by_name, mean_over_sequences
 from trainer.evaluation.voxelise import VoxelSettings
 from trainer.models import VoxelNetwork
@@ -28,6 +30,8 @@ from v2v_protocol.errors import UsageError
 
 SLACK = 0.05
 """How far below the best one's a correlation may be."""
+GRIDS = (0, 5, 10, 20, 40, 80, math.inf)
+"""Ends of the groups of windows, by the number of grids that a network has seen before."""
 
 
 class Verdict(NamedTuple):
@@ -64,26 +68,43 @@ def apply(figures: Mapping[str, Mapping[str, float]]) -> Verdict:
     return Verdict(ships, out)
 
 
+def grey_mse(_prediction: GreyImage, target: GreyImage) -> float:
+    """Return the squared error of a blank in the mean grey of the target [H, W]: a metric that needs no network."""
+    return float(target.var())
+
+
 def on_recordings(
     folder: Path, network: VoxelNetwork, metrics: Mapping[str, Metric], window_events: int, *, published: bool
-) -> dict[str, float]:
-    """Score a network on a folder of recordings: the mean over them of each metric, and ``grey_mse``.
+) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
+    """Score a network on a folder of recordings.
 
     Args:
         window_events: events of each window.
         published: take interpolated voxel grids, as published FireNet does.
 
+    Returns:
+        The mean over the recordings of each metric and of :func:`grey_mse`; and the same over all scored windows, by
+        the number of grids since the start, as far as there are any.
+
     Raises:
         UsageError: no window ends at a picture.
     """
     settings = VoxelSettings(bins=network.bins, kind="interpolated" if published else "discrete")
-    run = Run(network, settings, metrics, window_events=window_events)
+    every = {**metrics, "grey_mse": grey_mse}
+    run = Run(network, settings, every, window_events=window_events, score_blank=False)
     (data_set,) = folder_config(folder).data_sets
     scores = [evaluate_sequence(run, path, data_set) for path in find_recordings(folder, data_set).values()]
     scored = [each for each in scores if each.means]
     if not scored:
         raise UsageError(f"{folder}: no window of {window_events} events ends at a picture; write larger recordings")
-    return mean_over_sequences(scored) | {"grey_mse": mean_over_sequences(scored, blank=True)["mse"]}
+    windows = [window for each in scored for window in each.by_frame]
+    by_grids = {}
+    for first, end in itertools.pairwise(GRIDS):
+        among = [{name: window[name] for name in every} for window in windows if first <= window["frame"] < end]
+        if among:
+            name = f"grids {first + 1} to {end}" if end < math.inf else f"grids from {first + 1}"
+            by_grids[name] = {"windows": len(among), **mean_by_name(among)}
+    return mean_over_sequences(scored), by_grids
 
 
 def on_worlds(samples: tuple[Tensor, Tensor], network: VoxelNetwork, metrics: Mapping[str, Metric]) -> dict[str, float]:

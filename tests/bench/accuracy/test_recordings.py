@@ -80,13 +80,16 @@ def test_networks_are_judged_by_the_rule(tmp_path: Path, monkeypatch: pytest.Mon
     flags = ["--photographs", "x", "--lpips", "alex", "x", "x"]
     networks = [f"--weights=mine={tmp_path}/weights.pth", f"--normalized-weights=published={tmp_path}/weights.pth"]
     found = written(tmp_path, monkeypatch, *flags, *networks)
-    judged = [record for record in found.records if "network" in record]
+    judged = [record for record in found.records if "network" in record and "windows" not in record]
     assert [(record["network"], record["data"]) for record in judged] == [
         (name, data) for name in ("mine", "published") for data in ("recordings", "worlds", "mean")
     ]
     for one, other, mean in zip(judged[::3], judged[1::3], judged[2::3], strict=True):
         assert mean["mse"] == pytest.approx((one["mse"] + other["mse"]) / 2)
         assert min(one["grey_mse"], other["grey_mse"]) > 0.05  # 1 / 12 is that of random greys
+    parts = [record for record in found.records if "windows" in record]
+    assert {record["data"] for record in parts} == {"grids from 81"}  # the first 100 ms have no picture
+    assert {record["network"] for record in parts} == {"mine", "published"}
     text = " ".join(found.lines)
     assert "mine" in text
     assert "published" not in text

@@ -75,7 +75,8 @@ def test_recordings_without_a_scored_picture_are_left_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, published: bool
 ) -> None:
     written(tmp_path, monkeypatch)
-    found = rule.on_recordings(
+    found, by_grids = rule.on_recordings(
         tmp_path, NETWORKS["firenet"](base_channels=2), make_metrics(["mse"], {}), 96, published=published
     )
     assert found.keys() == {"mse", "grey_mse"}
+    assert sum(each["windows"] for each in by_grids.values()) > 0
