@@ -34,6 +34,7 @@ BENCHES = {
     "photographs": "speed.photographs",
     "sequences": "speed.sequences",
     "link": "speed.link",
+    "step": "speed.step",
     "evt3": "speed.evt3",
     "physics": "accuracy.physics",
     "motion": "speed.motion",

@@ -17,7 +17,15 @@ from trainer.config_file import load_config, shipped, show_config
 from trainer.feed import flags_of
 from trainer.learner import build, obeying_weights
 from trainer.loop import Diverged, train
-from trainer.run.checkpoint import LAST, Checkpoint, load_checkpoint, require_fresh, require_same_run, require_writable
+from trainer.run.checkpoint import (
+    LAST,
+    Checkpoint,
+    load_checkpoint,
+    numerics_of,
+    require_fresh,
+    require_same_run,
+    require_writable,
+)
 from trainer.run.distributed import Ranks, ranks
 from trainer.run.interruption import StopRequest
 from trainer.run.reporting import CONFIGURATION
@@ -183,12 +191,12 @@ def run(arguments: argparse.Namespace) -> int:
     Raises:
         V2VError: see :func:`load_config`, :func:`trainer.learner.build` and :func:`trainer.loop.train`.
     """
-    config = load_config(arguments.config, _settings(arguments))
+    resume = None if arguments.resume is None else load_checkpoint(arguments.resume)
+    config = load_config(arguments.config, _settings(arguments), None if resume is None else numerics_of(resume))
     if arguments.show_config:
         print(show_config(config), end="")
         return 0
-    resume = None
-    if arguments.resume is None:
+    if resume is None:
         config = obeying_weights(config)
         out = Path(config.run.out or f"runs/{Path(arguments.config).stem}")
         require_fresh(out)
@@ -200,7 +208,6 @@ def run(arguments: argparse.Namespace) -> int:
         out = Path(config.run.out or begun_in)
         if out.resolve() != begun_in.resolve():
             require_fresh(out)
-        resume = load_checkpoint(arguments.resume)
         config = config.with_network_options(resume.config["network"]["options"], weights="")
         for change in require_same_run(resume, config):
             print(f"v2v-train: changed since the checkpoint: {change}", file=sys.stderr)
