@@ -53,7 +53,7 @@ class ContinuedClip:
         while first < steps:
             carried = self._carried or self._new_state(given)
             last = min(first + self._steps_at_once, steps)
-            piece = replace(_piece(given, first, last), carried=carried)
+            piece = replace(part_of(given, first, last), carried=carried)
             count, events = list_piece(
                 piece, self._real, np.diff(since_us[first : last + 1]), since_us[first : last + 1], self._rows
             )
@@ -74,7 +74,7 @@ class ContinuedClip:
         return Carried(np.empty(shape, self._real), np.empty(shape, self._real))
 
 
-def _piece(given: KernelInput, first: int, last: int) -> KernelInput:
+def part_of(given: KernelInput, first: int, last: int) -> KernelInput:
     """Return the steps from ``first`` to before ``last`` of a clip; each is a bin."""
     levels = given.levels
     if levels is not None:
