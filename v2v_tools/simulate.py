@@ -24,6 +24,7 @@ from v2v_server.config import ServeConfig
 from v2v_server.kinds.registry import KindFlags, kind_from
 from v2v_server.quarantine import Quarantine, quarantine_path, read_quarantine
 from v2v_server.worker.making.make import list_sample_events
+from v2v_tools import whole
 from v2v_tools.event_files import EVENT_WRITERS, check_event_file, write_events
 from v2v_tools.remake import Remaker, open_shown
 
@@ -33,6 +34,8 @@ _MOMENTS = 4
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status."""
+    if "--whole" in (sys.argv[1:] if argv is None else argv):
+        return whole.main(argv)
     parser = Parser(
         "v2v-simulate", "VIDEO --out FILE.npz [flags]",
         "Make one sample in this process: the same bytes a server would stream.",
@@ -43,6 +46,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     )  # fmt: skip
     which = parser.group("Which sample")
     which.add_argument("video", metavar="VIDEO", help="a video; or a folder or list file, to remake a streamed sample")
+    which.add_argument(
+        "--whole", action="store_true", help="make events of whole videos instead: see v2v-simulate --whole --help"
+    )
     which.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the stream (default 0)")
     which.add_argument("--epoch", type=int, default=0, metavar="N", help="default 0")
     which.add_argument("--index", type=int, default=0, metavar="N", help="global index in the epoch (default 0)")

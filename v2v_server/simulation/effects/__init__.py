@@ -70,6 +70,7 @@ def prepare(
     step_seconds: npt.NDArray[np.float64],
     pixels: int,
     real: Real,
+    first: int = 0,
 ) -> tuple[Any, ...]:
     """Return the tables of every effect for one clip, in the order of :data:`EFFECTS`.
 
@@ -80,10 +81,13 @@ def prepare(
         step_seconds: [steps] duration of each step, which is a segment (``voxel.Timeline``).
         pixels: number of pixels of the picture.
         real: arithmetic of the pixels, float32 or float64.
+        first: number of the first step; above 0 for a clip that continues another one.
 
     Raises:
         UsageError: more shot events in a step than can be drawn.
     """
     durations, table_of_step = np.unique(step_seconds, return_inverse=True)
-    clip = Clip(linear_light(*intensity), step_seconds, durations, table_of_step.astype(np.int64), pixels, real, key)
+    clip = Clip(
+        linear_light(*intensity), step_seconds, durations, table_of_step.astype(np.int64), pixels, real, key, first
+    )
     return tuple(effect.prepare(values.get(effect.FIELD, 0.0), clip) for effect in EFFECTS)

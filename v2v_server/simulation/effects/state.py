@@ -36,6 +36,7 @@ class Clip(NamedTuple):
         pixels: number of pixels of the picture.
         real: arithmetic of the pixels, float32 or float64.
         key: key of the sample's noise.
+        first: number of the first step.
     """
 
     light: npt.NDArray[np.float64]
@@ -45,6 +46,7 @@ class Clip(NamedTuple):
     pixels: int
     real: Real
     key: noise.NoiseKey
+    first: int = 0
 
 
 class Block(NamedTuple):
