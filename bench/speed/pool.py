@@ -43,7 +43,10 @@ def shared_pool(asked: argparse.Namespace) -> Iterator[list[LocalServer]]:
     command = [sys.executable, "-m", "v2v_server.commands.worker", "--connect", ",".join(addresses)]
     with ExitStack() as opened:
         workers = [
-            subprocess.Popen([*command, "--videos", str(asked.videos)], stdin=subprocess.DEVNULL)
+            # In sessions of their own, as a server starts its workers: the kernel shares busy cores by session.
+            subprocess.Popen(
+                [*command, "--videos", str(asked.videos)], stdin=subprocess.DEVNULL, start_new_session=True
+            )
             for _ in range(asked.workers)
         ]
         for worker in workers:
