@@ -29,6 +29,7 @@ BENCHES = {
     "scaling": "speed.scaling",
     "catalogue": "speed.catalogue",
     "sharing": "speed.sharing",
+    "pool": "speed.pool",
     "cache": "speed.cache",
     "store": "speed.store",
     "photographs": "speed.photographs",
