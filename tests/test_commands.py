@@ -49,6 +49,8 @@ _LAUNCHED = {
     "tests.tools.trace": "tests.tools.trace",
 }
 """What `python` and `torchrun` start beside benches."""
+_EXPORT = "v2v-train-export"
+"""`v2v-train export`, which has flags of its own."""
 _STANDS_FOR_ANY = {"train.py": "the reader's own script"}
 PAGES = sorted(
     page
@@ -89,14 +91,15 @@ def parser_of(module: str) -> argparse.ArgumentParser:
 
 def flags_of(program: str) -> frozenset[str]:
     """Return all flags that the program's own parser knows."""
-    return frozenset(parser_of(MODULES[program])._option_string_actions)
+    module = "trainer.run.export" if program == _EXPORT else MODULES[program]
+    return frozenset(parser_of(module)._option_string_actions)
 
 
 def command_lines(text: str) -> list[tuple[str, list[str]]]:
     """Yield (program, its flags) for each command line in a text. A backslash at the end continues a line."""
     joined = re.sub(r"\\\n\s*#?\s*", " ", text)
     return [
-        (program, _FLAG.findall(rest))
+        (_EXPORT if (program, rest.split()[:1]) == ("v2v-train", ["export"]) else program, _FLAG.findall(rest))
         for said, rest in _LINE.findall(joined)
         if (program := said.replace(" ", "-")) in MODULES
     ]
@@ -164,6 +167,8 @@ def wrong_with(words: list[str]) -> str:
         return f"there is no {missing}" if missing else ""
     if program in ("python", "torchrun"):
         return _wrong_with_launched(rest)
+    if (program, rest[:1]) == ("v2v-train", ["export"]):
+        return _refused(parser_of("trainer.run.export"), rest[1:])
     return _refused(parser_of(MODULES[program]), rest) if program in MODULES else "no program"
 
 
@@ -231,5 +236,5 @@ def test_programs_and_flags_named_in_prose_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     assert set(PROGRAM.findall(text)) <= {*MODULES, "v2v-stream", "v2v-workers"}
     named = set(BARE.findall(text)) - set(OF_OTHERS)
-    parsers = [*map(parser_of, MODULES.values()), *map(parser_for, BENCHES)]
+    parsers = [*map(parser_of, (*MODULES.values(), "trainer.run.export")), *map(parser_for, BENCHES)]
     assert named <= {flag for parser in parsers for flag in parser._option_string_actions}
