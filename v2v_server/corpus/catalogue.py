@@ -333,7 +333,8 @@ class Catalogue:
             CorpusError: there is no such id in this catalogue, or no such folder on this host.
         """
         self.source.expected = id, self.state(id) or ()
-        with self.folder and self.source.open_local(id, "") as path:
+        self.folder  # noqa: B018 - raises where there is none
+        with self.source.open_local(id, "") as path:
             return Path(os.fspath(path))
 
     def check(self, id: str, fingerprint: str, sidecar: str = "") -> None:

@@ -61,7 +61,7 @@ def opened(folder: Path, cache: Path, **options: Any) -> closing[Catalogue]:
 
 def snapshot(catalogue: Catalogue) -> tuple[Any, ...]:
     """All that a consumer can tell: ids, what is known of each video, refusals, digest and samples."""
-    videos = [(*each.__getstate__(),) for each in catalogue.videos]  # type: ignore[attr-defined]
+    videos = list(catalogue.videos)
     refusals = [(each.video, each.frame, each.reason) for each in catalogue.refusals]
     arrays = [
         (each.provenance, *(each.arrays[name].tobytes() for name in ROW.arrays)) for each in samples_of(catalogue, ROW)

@@ -60,7 +60,8 @@ def count_left_out(name: str, left_out: Counter[str]) -> None:
             prefix = name[: -2 if name[-1].isalpha() else -3]
             left_out[printable(text.format(prefix=prefix, **found.groupdict()))] += 1
             return
-    left_out[_PARQUET] += name.endswith(".parquet")
+    if name.endswith(".parquet"):
+        left_out[_PARQUET] += 1
     stem, _, ending = name.rpartition(".")
     suffix = printable(f".{ending.lower()}")
     if stem and len(suffix) <= 12 and suffix not in _NO_VIDEO_SUFFIXES:
