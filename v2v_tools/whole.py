@@ -19,7 +19,7 @@ from v2v_protocol.programs import counted, show
 from v2v_protocol.progress import Progress
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import add_spec, asked_recipe, recipe_setting, spec_fields
-from v2v_protocol.write_aside import make_output_folder, write_file
+from v2v_protocol.write_aside import check_outside, make_output_folder, write_file
 from v2v_server.broker.leases import Request
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
@@ -108,6 +108,7 @@ def _run(asked: argparse.Namespace) -> int:
         raise UsageError("--whole with photographs: each sample has a path of its own; use --index without --whole")
     if asked.jobs < 1:
         raise UsageError(f"--jobs {asked.jobs}: give a whole number from 1")
+    check_outside("--out", asked.out, filter(None, (asked.video, asked.list)))
     catalogue = open_shown(
         asked.video, list_file=asked.list, rows=asked.rows or "full", scene=spec.scene != "off",
         cache_dir=asked.cache_dir, kind=kind,
