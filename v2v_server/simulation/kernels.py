@@ -203,7 +203,7 @@ def list_piece(
     listed = min(count, len(rows.own))
     place, t, p = np.empty((2, listed), np.uint16), np.empty(listed, np.int64), np.empty(listed, np.bool_)
     columns_in_order(rows.own[:listed], rows.spare[:listed], width, place, t, p)
-    return count, EventList(*place, t, p, width, height)
+    return count, EventList(place[0], place[1], t, p, width, height)
 
 
 @dataclass(frozen=True, slots=True, repr=False, eq=False)
