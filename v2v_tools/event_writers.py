@@ -17,20 +17,20 @@ from v2v_recordings.items import EventChunk
 from v2v_recordings.limits import check_size
 
 
-class Form(NamedTuple):
+class StreamedForm(NamedTuple):
     """Ending of a form's files, its name in FORM_LIMITS."""
 
     ending: str
     limits: str
 
 
-FORMS = {"h5": Form(".h5", "DSEC's layout"), "raw": Form(".raw", "EVT 3")}
+STREAMED_FORMS = {"h5": StreamedForm(".h5", "DSEC's layout"), "raw": StreamedForm(".raw", "EVT 3")}
 
 
 def check_form(path: Path, form: str, width_px: int, height_px: int) -> None:
     """Check that a form can hold a picture. Raises: UsageError: it cannot."""
-    others = " or ".join(name for name in FORMS if name != form)
-    check_size(str(path), FORMS[form].limits, width_px, height_px, f"give --events {others}")
+    others = " or ".join(name for name in STREAMED_FORMS if name != form)
+    check_size(str(path), STREAMED_FORMS[form].limits, width_px, height_px, f"give --events {others}")
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from v2v_protocol.programs import counted, show
 from v2v_protocol.progress import Progress
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import add_spec, asked_recipe, recipe_setting, spec_fields
-from v2v_protocol.write_aside import make_output_folder, write_file
+from v2v_protocol.write_aside import check_outside, make_output_folder, write_file
 from v2v_server.broker.leases import Request
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
@@ -30,7 +30,7 @@ from v2v_server.simulation.continued import ContinuedClip, part_of
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.worker.making.make import simulate
-from v2v_tools.event_writers import FORMS, check_form, open_writer
+from v2v_tools.event_writers import STREAMED_FORMS, check_form, open_writer
 from v2v_tools.remake import lease_for, open_shown
 from v2v_tools.whole_clip import WholeClip, spec_of_whole
 
@@ -43,7 +43,7 @@ class WholeVideo(Persisted):
         lease: its clip, and the camera; the index of all its frames.
         shots: first frame of each shot after the first one, stride applied.
         path: the recording.
-        form: its form, a key of ``FORMS``.
+        form: its form, a key of ``STREAMED_FORMS``.
         has_frames: whether pictures are written too.
         frames: number of frames.
     """
@@ -89,7 +89,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_settings(KindFlags)
     out = parser.group("Output")
     out.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the recordings")
-    out.add_argument("--events", choices=tuple(FORMS), required=True, help="form of the recordings")
+    out.add_argument("--events", choices=tuple(STREAMED_FORMS), required=True, help="form of the recordings")
     out.add_argument("--frames", action="store_true", help="also write the frames as the camera sees them")
     out.add_argument("--jobs", type=int, default=1, metavar="N", help="videos at a time (default 1)")
     add_spec(parser)
@@ -108,6 +108,7 @@ def _run(asked: argparse.Namespace) -> int:
         raise UsageError("--whole with photographs: each sample has a path of its own; use --index without --whole")
     if asked.jobs < 1:
         raise UsageError(f"--jobs {asked.jobs}: give a whole number from 1")
+    check_outside("--out", asked.out, filter(None, (asked.video, asked.list)))
     catalogue = open_shown(
         asked.video, list_file=asked.list, rows=asked.rows or "full", scene=spec.scene != "off",
         cache_dir=asked.cache_dir, kind=kind,
@@ -148,7 +149,7 @@ def whole_video(catalogue: Catalogue, rank: int, spec: StreamSpec, asked: argpar
     """
     video = catalogue.videos[rank]
     whole = spec_of_whole(spec, video, catalogue.rows)
-    path = asked.out / f"{video.id.rstrip('/')}{FORMS[asked.events].ending}"
+    path = asked.out / f"{video.id.rstrip('/')}{STREAMED_FORMS[asked.events].ending}"
     check_form(path, asked.events, whole.recipe.crop_width_px, whole.recipe.crop_height_px)
     lease = lease_for(
         Request(b"", asked.epoch, rank), sequence=VideoSequence(video, 0), catalogue=catalogue, spec=whole,

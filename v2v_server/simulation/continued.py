@@ -14,7 +14,7 @@ from v2v_server.simulation.precision import Real
 from v2v_server.simulation.representations.listing import new_rows
 from v2v_server.simulation.voxel import Doubles, Levels, Moments, bin_edges
 
-MOST_EVENTS = 1 << 21
+PIECE_EVENTS = 1 << 21
 """Events of a piece, unless a single step has more: 64 MiB to list and sort them."""
 _FULL = 0.8
 """Part of them that the next piece should have, if its steps fire as often as those of the last one."""
@@ -28,7 +28,7 @@ class ContinuedClip:
         most_events: events of a piece, unless a single step has more.
     """
 
-    def __init__(self, real: Real = np.float64, most_events: int = MOST_EVENTS) -> None:
+    def __init__(self, real: Real = np.float64, most_events: int = PIECE_EVENTS) -> None:
         self._real, self._rows = real, new_rows(most_events)
         self._carried: Carried | None = None
         self._steps_at_once = 1

@@ -24,7 +24,7 @@ from v2v_server.simulation.intensity import Intensity, fine_table, log_table, lo
 from v2v_server.simulation.pixel import hot_pixels, simulate_pixels
 from v2v_server.simulation.precision import Real
 from v2v_server.simulation.representations import NAMES, REPRESENTATIONS, fill_array, new_memory
-from v2v_server.simulation.representations.listing import Listing, Rows, columns_in_order, new_rows
+from v2v_server.simulation.representations.listing import EventRows, Listing, columns_in_order, new_rows
 from v2v_server.simulation.voxel import (
     LARGEST_COUNT,
     Doubles,
@@ -180,7 +180,7 @@ def list_events(given: KernelInput, real: Real, step_us: Doubles) -> EventList:
 
 
 def list_piece(
-    given: KernelInput, real: Real, step_us: Doubles, since_us: Doubles, rows: Rows
+    given: KernelInput, real: Real, step_us: Doubles, since_us: Doubles, rows: EventRows
 ) -> tuple[int, EventList]:
     """List the events of a piece of a clip, see :func:`list_events`.
 
@@ -203,7 +203,7 @@ def list_piece(
     listed = min(count, len(rows.own))
     place, t, p = np.empty((2, listed), np.uint16), np.empty(listed, np.int64), np.empty(listed, np.bool_)
     columns_in_order(rows.own[:listed], rows.spare[:listed], width, place, t, p)
-    return count, EventList(*place, t, p, width, height)
+    return count, EventList(place[0], place[1], t, p, width, height)
 
 
 @dataclass(frozen=True, slots=True, repr=False, eq=False)

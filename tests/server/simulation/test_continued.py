@@ -46,7 +46,7 @@ def columns(*events: EventList) -> list[Any]:
     return [np.concatenate([getattr(each, name) for each in events]) for name in "xytp"]
 
 
-@pytest.mark.parametrize("real", [np.float64, pytest.param(np.float32, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("real", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
 @settings(max_examples=40, deadline=None)
 @given(
     names=st.sets(st.sampled_from(sorted(EFFECTS))),
@@ -82,7 +82,7 @@ def test_after_a_restart_pixels_forget_what_they_saw() -> None:
     quiet = clip_of({})
     quiet = dataclasses.replace(quiet, params=dataclasses.replace(quiet.params, noise_sigma=0.0, hot_pixel_count=0))
     again = dataclasses.replace(quiet, frames=quiet.frames[::-1])
-    clip = ContinuedClip()
+    clip = ContinuedClip(np.float32)
     first = columns(*clip.events(quiet, SINCE_US))
     assert len(first[0]) > 1000
     carried_on = columns(*clip.events(quiet, SINCE_US))

@@ -14,7 +14,7 @@ _DIGIT_BITS = 16
 """Bits of a time that one pass of the sort looks at; its counters then fit into a core's cache."""
 
 
-class Rows(NamedTuple):
+class EventRows(NamedTuple):
     """Memory for events, [capacity, 2] int64, and as much again for the sort."""
 
     own: Any
@@ -37,9 +37,9 @@ class Listing(NamedTuple):
     last_us: Any
 
 
-def new_rows(capacity: int) -> Rows:
+def new_rows(capacity: int) -> EventRows:
     """Return memory for events."""
-    return Rows(np.empty((capacity, 2), np.int64), np.empty((capacity, 2), np.int64))
+    return EventRows(np.empty((capacity, 2), np.int64), np.empty((capacity, 2), np.int64))
 
 
 def prepare(memory, given, segments, real):
