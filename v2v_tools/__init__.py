@@ -2,7 +2,6 @@
 
 simulate        `v2v-simulate`: one sample as a file
 remake          any sample of any stream, made in this process
-event_files     events as HDF5, npz, EVT 3, AEDAT 4
 preview         `v2v-preview`: what a recipe makes of videos, as pictures
 motion          pictures without noise, and seeds whose cameras see motion
 doctor          `v2v-doctor`: what is in the way on this machine, and in a corpus

@@ -20,11 +20,11 @@ from v2v_protocol.sample import ARRAYS, DEFAULT_ARRAYS
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import add_spec, asked_recipe, recipe_setting, spec_fields
 from v2v_protocol.write_aside import write_aside_and_rename
+from v2v_recordings.writers import ENDINGS, check_form, form_of, write_events
 from v2v_server.config import ServeConfig
 from v2v_server.kinds.registry import KindFlags, kind_from
 from v2v_server.quarantine import Quarantine, quarantine_path, read_quarantine
 from v2v_server.worker.making.make import list_sample_events
-from v2v_tools.event_files import EVENT_WRITERS, check_event_file, write_events
 from v2v_tools.remake import Remaker, open_shown
 
 _MOMENTS = 4
@@ -63,8 +63,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_output(
         "Output",
         "--events",
-        tuple(EVENT_WRITERS),
-        f"also write the events with their times: {', '.join(EVENT_WRITERS)}",
+        tuple(ENDINGS),
+        f"also write the events with their times: {', '.join(ENDINGS)}",
     )
     out.add_argument(
         "--arrays", default=",".join(DEFAULT_ARRAYS), metavar="NAME,NAME",
@@ -84,7 +84,7 @@ def _run(asked: argparse.Namespace) -> None:
     if asked.picture is not None:
         check_drawable(arrays)
     if asked.events is not None:
-        check_event_file(asked.events, spec.recipe.crop_width_px, spec.recipe.crop_height_px)
+        check_form(asked.events, form_of(asked.events), spec.recipe.crop_px[::-1])
     catalogue = open_shown(
         asked.video, list_file=asked.list, rows=asked.rows or "full", scene=spec.scene != "off",
         cache_dir=asked.cache_dir, kind=kind_from(vars(asked)),
