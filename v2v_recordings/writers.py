@@ -106,7 +106,7 @@ class EventWriter:
         self._pending_events = self._last_us = 0
         self._stamps: dict[str, list[int]] = {name: [] for name in planes}
         self._planes: dict[str, _Rows] = {}
-        self.events = 0
+        self.events, self._is_closed = 0, False
         self._files = contextlib.ExitStack()
         with contextlib.ExitStack() as opening:
             opening.push(self._files)  # closed only after an error
@@ -161,7 +161,10 @@ class EventWriter:
         stamps.append(microseconds)
 
     def close(self) -> None:
-        """Complete the file, and give it its name."""
+        """Complete the file, and give it its name; a second call does nothing."""
+        if self._is_closed:
+            return
+        self._is_closed = True
         with self._words(), self._files:
             self._flush(self._pending_events)
             self._finish()
