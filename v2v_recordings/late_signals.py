@@ -13,6 +13,9 @@ def late_signals() -> Iterator[Callable[[], None]]:
     """Yield a function that raises KeyboardInterrupt if a Ctrl-C or SIGTERM has come; it comes at no other place.
 
     Python would raise it in the functions by which HDF5 writes, and HDF5 then ends the process.
+
+    Raises:
+        KeyboardInterrupt: at the end of the block too.
     """
     came: list[int] = []
     is_main = threading.current_thread() is threading.main_thread()

@@ -115,6 +115,7 @@ class RecordingWriter:
             smallest that holds all events.
         published_shift: how many events earlier than ``event_idx`` the published conversion of this raw form pairs a
             picture with. If it is not 0, its choice is also written (``event_idx_published``).
+        pack_events: whether to compress events, to about half of their size. It takes most of the time of writing.
         origin_ns: the time that becomes 0; such a recording may be without events. None: that of the first item, and
             a recording needs events.
 
@@ -131,6 +132,7 @@ class RecordingWriter:
         size: SensorSize | None = None,
         published_shift: int = 0,
         origin_ns: int | None = None,
+        pack_events: bool = True,
     ) -> None:
         self._files = contextlib.ExitStack()
         self._source, self._size, self._published_shift = source, size, published_shift
@@ -152,11 +154,9 @@ class RecordingWriter:
             self._file, self._disk = self._files.enter_context(open_new(partial))
         except OSError as error:
             raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
+        packed = {"compression": "gzip", "compression_opts": 1, "shuffle": True} if pack_events else {}
         for name, dtype in _COLUMNS.items():
-            self._file.create_dataset(
-                f"events/{name}", (0,), dtype, maxshape=(None,), chunks=(H5_CHUNK,), compression="gzip",
-                compression_opts=1, shuffle=True,
-            )  # fmt: skip
+            self._file.create_dataset(f"events/{name}", (0,), dtype, maxshape=(None,), chunks=(H5_CHUNK,), **packed)
         self._file.create_group("images")
         self.written: Written | None = None
 
@@ -218,7 +218,7 @@ class RecordingWriter:
         self._picture_times.append(picture.t_ns)
 
     def add_plane(self, name: str, t_ns: int, plane: npt.NDArray[Any]) -> h5py.Dataset:
-        """Write a dataset with a time of the recording's clock, and return it."""
+        """Write a dataset, [H, W] or [2, H, W], with a time of the recording's clock, and return it."""
         self._disk.check()
         dataset = self._file.create_dataset(name, data=plane, compression="gzip", compression_opts=1)
         dataset.attrs["timestamp"] = (t_ns - self._set_origin(t_ns)) * 1e-9
@@ -307,7 +307,7 @@ class RecordingWriter:
         ts = self._file["events/ts"]
         times = np.array([self._file[layout.image_key(i)].attrs["timestamp"] for i in range(len(self._picture_times))])
         earlier = np.zeros(len(times), np.int64)
-        for start in range(0, self._events, FLUSH_EVENTS):
+        for start in range(0, self._events if len(times) else 0, FLUSH_EVENTS):
             earlier += np.searchsorted(ts[start : start + FLUSH_EVENTS], times, side="left")
         for index, count in enumerate(earlier):
             attributes = self._file[layout.image_key(index)].attrs

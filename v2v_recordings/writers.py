@@ -348,7 +348,7 @@ class _Npz(_Columns):
 
     def _finish(self) -> None:
         stated = {"width": np.int64(self._size.width), "height": np.int64(self._size.height), "note": np.array(_NOTE)}
-        with zipfile.ZipFile(self._target, "w", zipfile.ZIP_DEFLATED) as archive:
+        with zipfile.ZipFile(self._target, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             for name, rows in self._all().items():
                 rows.file.seek(0)
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
@@ -396,7 +396,7 @@ class _Layout(EventWriter):
         from v2v_recordings.layout_writer import RecordingWriter  # lazily: it loads h5py
 
         self._recording = self._files.enter_context(
-            RecordingWriter(self._path, source=self._source, size=self._size, origin_ns=0)
+            RecordingWriter(self._path, source=self._source, size=self._size, origin_ns=0, pack_events=False)
         )
 
     def _write(self, events: EventList) -> None:
