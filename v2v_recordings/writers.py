@@ -147,7 +147,11 @@ class EventWriter:
         self.add_plane("images", microseconds, picture)
 
     def add_plane(self, kind: str, microseconds: int, plane: npt.NDArray[Any]) -> None:
-        """Add a picture of a kind of PLANES: images and masks uint8 [H, W], flow [2, H, W] px until the next field."""
+        """Add a picture of a kind of PLANES: images and masks uint8 [H, W], flow [2, H, W] px until the next field.
+
+        Raises:
+            UsageError, V2VError: see :class:`EventWriter`.
+        """
         if kind not in self._planes:
             raise UsageError(f"{self._path}: {kind} were not announced when it was opened: name them in planes")
         shape, stamps = (*PLANES[kind][1], self._size.height, self._size.width), self._stamps[kind]
