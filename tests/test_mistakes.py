@@ -40,6 +40,7 @@ from v2v_protocol.settings import nearest, settings_of
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import recipe_setting
 from v2v_protocol.write_aside import write_json
+from v2v_recordings.writers import ENDINGS, write_events
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import list_corpus
 from v2v_server.corpus.sources.source import SourceOptions, open_source
@@ -47,7 +48,6 @@ from v2v_server.simulation.clip import simulate
 from v2v_server.simulation.kernels import Voxels
 from v2v_server.store.cache import make_cache
 from v2v_server.video.rows import Rows
-from v2v_tools.event_files import EVENT_WRITERS, write_events
 
 OUTPUTS = [
     ("v2v-preview a.mp4 --out a.mp4", ["--out a.mp4", "also reads"]),
@@ -183,7 +183,7 @@ OLDER = b"\x89PNG\r\n\x1a\nthe older file"
 WRITERS: dict[str, Callable[[Path], None]] = {
     ".png": _noise,
     ".json": lambda path: write_json(path, [{"key": "x" * 5000}]),
-    **dict.fromkeys(EVENT_WRITERS, _events),
+    **dict.fromkeys(ENDINGS, _events),
 }
 
 

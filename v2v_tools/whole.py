@@ -18,8 +18,9 @@ from v2v_protocol.persisted import Persisted
 from v2v_protocol.programs import counted, show
 from v2v_protocol.progress import Progress
 from v2v_protocol.spec import StreamSpec
-from v2v_protocol.spec_flags import add_spec, asked_recipe, recipe_setting, spec_fields
+from v2v_protocol.spec_flags import add_spec
 from v2v_protocol.write_aside import check_outside, make_output_folder, write_file
+from v2v_recordings.writers import EVENT_FORMS, check_form, open_writer
 from v2v_server.broker.leases import Request
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
@@ -30,9 +31,12 @@ from v2v_server.simulation.continued import ContinuedClip, part_of
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.worker.making.make import simulate
-from v2v_tools.event_writers import STREAMED_FORMS, check_form, open_writer
 from v2v_tools.remake import lease_for, open_shown
+from v2v_tools.sample_flags import asked_spec
 from v2v_tools.whole_clip import WholeClip, spec_of_whole
+
+_PLANES = ("images",)
+"""Kinds of pictures that a recording of a whole video may have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +47,7 @@ class WholeVideo(Persisted):
         lease: its clip, and the camera; the index of all its frames.
         shots: first frame of each shot after the first one, stride applied.
         path: the recording.
-        form: its form, a key of ``STREAMED_FORMS``.
+        form: its form, a key of ``EVENT_FORMS``.
         has_frames: whether pictures are written too.
         frames: number of frames.
     """
@@ -89,7 +93,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_settings(KindFlags)
     out = parser.group("Output")
     out.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the recordings")
-    out.add_argument("--events", choices=tuple(STREAMED_FORMS), required=True, help="form of the recordings")
+    out.add_argument("--events", choices=tuple(EVENT_FORMS), required=True, help="form of the recordings")
     out.add_argument("--frames", action="store_true", help="also write the frames as the camera sees them")
     out.add_argument("--jobs", type=int, default=1, metavar="N", help="videos at a time (default 1)")
     add_spec(parser)
@@ -101,8 +105,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(asked: argparse.Namespace) -> int:
     """Make a recording of each video that has none; return the exit status."""
-    spec = StreamSpec.from_dict(spec_fields(asked) | {"recipe": recipe_setting(asked_recipe(asked), asked.set)})
-    spec.recipe.warn()
+    spec = asked_spec(asked)
     kind = kind_from(vars(asked))
     if kind.is_view:
         raise UsageError("--whole with photographs: each sample has a path of its own; use --index without --whole")
@@ -149,8 +152,8 @@ def whole_video(catalogue: Catalogue, rank: int, spec: StreamSpec, asked: argpar
     """
     video = catalogue.videos[rank]
     whole = spec_of_whole(spec, video, catalogue.rows)
-    path = asked.out / f"{video.id.rstrip('/')}{STREAMED_FORMS[asked.events].ending}"
-    check_form(path, asked.events, whole.recipe.crop_width_px, whole.recipe.crop_height_px)
+    path = asked.out / f"{video.id.rstrip('/')}{EVENT_FORMS[asked.events].ending}"
+    check_form(path, asked.events, whole.recipe.crop_px[::-1], _PLANES if asked.frames else ())
     lease = lease_for(
         Request(b"", asked.epoch, rank), sequence=VideoSequence(video, 0), catalogue=catalogue, spec=whole,
         seed=asked.seed, arrays=(),
@@ -182,7 +185,7 @@ def _identity(job: WholeVideo) -> dict[str, Any]:
     return {
         "video": lease.video, "fingerprint": lease.fingerprint, "spec": json.loads(lease.spec), "rows": lease.rows,
         "seed": lease.seed, "epoch": lease.epoch, "index": lease.indices[0], "numerics_version": NUMERICS_VERSION,
-        "shots": [0, *job.shots], "has_frames": job.has_frames,
+        "shots": [0, *job.shots], "has_frames": job.has_frames, "form": job.form,
     }  # fmt: skip
 
 
@@ -230,7 +233,7 @@ def make_recording(source: VideoSource, job: WholeVideo, advance: Callable[[int]
     clip = WholeClip(job.lease)
     job.path.parent.mkdir(parents=True, exist_ok=True)
     camera, events = ContinuedClip(), 0
-    with open_writer(job.path, job.form, size=clip.size) as writer:
+    with open_writer(job.path, job.form, clip.size, _PLANES if job.has_frames else ()) as writer:
         for first, context in clip.parts(source):
             last = first + len(context.view) - 1
             if job.has_frames:
@@ -247,7 +250,6 @@ def make_recording(source: VideoSource, job: WholeVideo, advance: Callable[[int]
                     writer.add(found)
                     events += len(found)
             advance(last - first + (first == 0))
-        writer.close()
     record = _identity(job) | {
         "params": context.params.to_dict(), "frames": job.frames, "events": events, "remark": job.lease.remark
     }  # fmt: skip

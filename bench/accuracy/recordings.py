@@ -31,11 +31,11 @@ from bench.frame import Column, Record, Report, add_whole, progress
 from tests.oracles.decoded import decode_luma
 from tests.oracles.dense import dense_events
 from tests.oracles.rendered import GAMMA, NAMES, Reals, rendered_scene
-from trainer.convert.writer import RecordingWriter
 from trainer.evaluation.metrics import make_metrics
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_recordings.items import EventChunk, Picture
+from v2v_recordings.layout_writer import RecordingWriter
 from v2v_server.video.probe import probe
 
 SECONDS, RENDERED_HZ, PICTURE_EVERY_SECONDS, FIRST_SECONDS = 0.6, 800.0, 0.02, 0.1

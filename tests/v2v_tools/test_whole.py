@@ -8,12 +8,14 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 
 from tests.clips import panned_luma, write_clip, write_panned
+from v2v_recordings.writers import EventWriter
 from v2v_server.simulation import continued
-from v2v_tools import event_writers, whole_clip
+from v2v_tools import whole_clip
 from v2v_tools.simulate import main
 
 SLOW = pytest.mark.slow  # the general kernel in float64
@@ -30,8 +32,6 @@ def simulate(videos: Path, out: Path, *flags: str, form: str = "h5") -> int:
 
 
 def read(path: Path) -> dict[str, Any]:
-    import h5py
-
     found: dict[str, Any] = {}
     with h5py.File(path) as file:
         file.visititems(lambda name, item: found.update({name: item[()]}) if isinstance(item, h5py.Dataset) else None)
@@ -60,12 +60,12 @@ def test_what_is_read_and_simulated_at_a_time_changes_no_event(tmp_path: Path, m
         assert found.keys() == whole.keys()
         for name, values in whole.items():
             np.testing.assert_array_equal(found[name], values)
-    assert len(whole["events/t"]) > 3000
-    assert (np.diff(whole["events/t"]) >= 0).all()
-    assert whole["frames/t"].tolist() == [40_000 * number for number in range(40)]
-    np.testing.assert_array_equal(
-        whole["ms_to_idx"][:-1], np.searchsorted(whole["events/t"], 1000 * np.arange(len(whole["ms_to_idx"]) - 1))
-    )
+    assert len(whole["events/ts"]) > 3000
+    assert (np.diff(whole["events/ts"]) >= 0).all()
+    assert sum(name.startswith("images/") for name in whole) == 40
+    with h5py.File(tmp_path / "whole/a.mp4.h5") as file:
+        stamps = [image.attrs["timestamp"] for image in file["images"].values()]
+    np.testing.assert_allclose(stamps, 0.04 * np.arange(40), atol=1e-9)
 
 
 @SLOW
@@ -90,7 +90,7 @@ def test_a_second_start_makes_what_is_missing_and_refuses_other_settings(tmp_pat
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
 def test_a_recording_that_cannot_be_ended_leaves_nothing(tmp_path: Path, monkeypatch: Any, error: Any) -> None:
     videos, out, calls = write_panned(tmp_path / "videos", 2, 12), tmp_path / "out", list[int]()
-    add = event_writers._Hdf5.add
+    add = EventWriter.add
 
     def failing(self: Any, events: Any) -> None:
         calls.append(1)
@@ -98,7 +98,7 @@ def test_a_recording_that_cannot_be_ended_leaves_nothing(tmp_path: Path, monkeyp
             raise error
         add(self, events)
 
-    monkeypatch.setattr(event_writers._Hdf5, "add", failing)
+    monkeypatch.setattr(EventWriter, "add", failing)
     is_disk = isinstance(error, OSError)
     assert simulate(videos, out) == (1 if is_disk else 130)
     assert len(files(out)) == (2 if is_disk else 0)
@@ -115,7 +115,7 @@ def test_a_cut_begins_a_new_state_without_events_of_its_own(tmp_path: Path) -> N
     cut, kept = tmp_path / "cut", tmp_path / "kept"
     for out, flags in ((cut, ["--scene", "auto"]), (kept, [])):
         assert main([
-            "--whole", str(tmp_path / "videos"), "--out", str(out), "--events", "h5", "--cache-dir", f"{out}-index",
+            "--whole", str(tmp_path / "videos"), "--out", str(out), "--events", "dsec", "--cache-dir", f"{out}-index",
             *quiet, *flags,
         ]) == 0  # fmt: skip
     note = json.loads((cut / "cut.mkv.h5.provenance.json").read_text())
@@ -132,7 +132,10 @@ def test_a_cut_begins_a_new_state_without_events_of_its_own(tmp_path: Path) -> N
 def test_a_form_that_cannot_hold_the_picture_is_refused_before_work(tmp_path: Path, capfd: Any) -> None:
     write_clip(tmp_path / "videos/wide.mkv", np.zeros((2, 2, 2050), np.uint8), codec="ffv1", pixel_format="gray")
     assert simulate(tmp_path / "videos", tmp_path / "out", form="raw") == 2
-    assert "2050 x 2 px; EVT 3 holds at most 2048 px a side: give --events h5" in capfd.readouterr().err
+    assert (
+        "2050 x 2 px; EVT 3 holds at most 2048 px a side: give a smaller crop, or another form: h5, dsec"
+        in capfd.readouterr().err
+    )
     assert without_files(tmp_path / "out")
 
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import SidecarError, UsageError, V2VError, VideoError
-from v2v_protocol.events import EventList
+from v2v_protocol.events import EventList, whole_edges
 from v2v_protocol.sample import ARRAYS, Needs, Provenance, Sample, SampleId, needs_of, new_arrays, sidecar_endings
 from v2v_protocol.spec import MARGIN_PX
 from v2v_server.flow import flow_for
@@ -118,6 +118,17 @@ def list_sample_events(clip: ClipJob, decoded: Decoded) -> EventList:
     context, _ = sample_context(clip, decoded, Needs(events=True, seconds="must"))
     made = simulate(context, {})
     return list_events(made.given, made.real, 1e6 * made.given.step_seconds)
+
+
+def span_ends_us(clip: ClipJob, decoded: Decoded) -> npt.NDArray[np.int64]:
+    """Return the times between which a sample's spans lie, [recipe.spans + 1], microseconds as of its events.
+
+    Raises:
+        VideoError: the video's frame rate is unknown.
+    """
+    seconds, _ = _step_seconds(clip, decoded)
+    times_us = whole_edges(1e6 * np.concatenate([[0.0], np.cumsum(seconds)]))
+    return times_us[decoded.plan.params.ends(clip.spec.recipe)]
 
 
 def sample_context(

@@ -15,10 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trainer.convert import cli
-from trainer.convert import writer as writer_module
-from trainer.convert.writer import RecordingWriter, Written
 from v2v_protocol.errors import UsageError
+from v2v_recordings import layout_writer as writer_module
 from v2v_recordings.items import EventChunk, Item, Picture, SensorSize
+from v2v_recordings.layout_writer import RecordingWriter, Written
 from v2v_recordings.reading import FORMS, RawForm
 
 

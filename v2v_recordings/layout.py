@@ -11,6 +11,9 @@
 | ... attribute ``event_idx_published`` | integer, optional | ``event_idx`` as the published conversion writes it |
 | ``flow/<key>`` | float32 [2, H, W], optional | flow (x, y), px, until the next field; NaN: not known |
 | ... attribute ``timestamp`` | float | seconds, the clock of ``ts`` |
+| ``flow_dt1/<key>`` | float32 [2, H, W], optional | the field before, by the time at which it ends, for event_flow |
+| ``masks/<key>`` | uint8 [H, W], optional | classes, with ``timestamp`` |
+| root attributes ``t0``, ``duration`` | float | seconds: the first event, and from it to the last one |
 | root attribute ``light`` | text, optional | of the pictures: linear, srgb or the exponent of their light |
 | root attribute ``sensor_resolution`` | 2 integers | height, width |
 """

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -20,10 +21,11 @@ from typing import Any
 
 import h5py
 import numpy as np
+import numpy.typing as npt
 
-from trainer.evaluation import layout
 from v2v_protocol.errors import UsageError
 from v2v_protocol.write_aside import write_aside_and_rename
+from v2v_recordings import layout
 from v2v_recordings.items import EventChunk, FlowField, Item, Light, Note, Picture, SensorSize
 
 FLUSH_EVENTS = 1 << 19
@@ -88,6 +90,21 @@ class _Disk(io.FileIO):
             raise self.error
 
 
+@contextlib.contextmanager
+def open_new(path: Path) -> Iterator[tuple[h5py.File, _Disk]]:
+    """Open a new HDF5 file until the end of the block, and its :class:`_Disk`, to be checked while it is written.
+
+    Raises:
+        OSError: it cannot be created, or, at the end, not all of it could be written.
+    """
+    with _Disk(path, "w+") as disk:
+        try:
+            with h5py.File(disk, "w") as file:
+                yield file, disk
+        finally:
+            disk.check()  # what could not be written cannot be read back either
+
+
 class RecordingWriter:
     """Write a recording inside a ``with`` block. A normal exit completes the file, an exception removes it.
 
@@ -98,18 +115,31 @@ class RecordingWriter:
             smallest that holds all events.
         published_shift: how many events earlier than ``event_idx`` the published conversion of this raw form pairs a
             picture with. If it is not 0, its choice is also written (``event_idx_published``).
+        pack_events: whether to compress events, to about half of their size. It takes most of the time of writing.
+        origin_ns: the time that becomes 0; such a recording may be without events. None: that of the first item, and
+            a recording needs events.
 
     Raises:
         UsageError: the folder cannot be written to.
         OSError: in the methods: the file cannot be written further.
     """
 
-    def __init__(self, path: Path, *, source: str, size: SensorSize | None = None, published_shift: int = 0) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        source: str,
+        size: SensorSize | None = None,
+        published_shift: int = 0,
+        origin_ns: int | None = None,
+        pack_events: bool = True,
+    ) -> None:
         self._files = contextlib.ExitStack()
         self._source, self._size, self._published_shift = source, size, published_shift
         self._pending: list[EventChunk] = []
         self._pending_events = 0
-        self._origin_ns: int | None = None
+        self._origin_ns = origin_ns
+        self._may_be_empty = origin_ns is not None
         self._last_ns: int | None = None
         self._largest = SensorSize(0, 0)
         self._notes: list[str] = []
@@ -117,18 +147,16 @@ class RecordingWriter:
         self._picture_size: SensorSize | None = None
         self._picture_times: list[int] = []
         self._events = self._reordered = self._flow_fields = 0
+        self._flow: npt.NDArray[np.float32] | None = None
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             partial = self._files.enter_context(write_aside_and_rename(path, durable=True))
-            self._disk = self._files.enter_context(_Disk(partial, "w+"))
-            self._file = self._files.enter_context(h5py.File(self._disk, "w"))
+            self._file, self._disk = self._files.enter_context(open_new(partial))
         except OSError as error:
             raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
+        packed = {"compression": "gzip", "compression_opts": 1, "shuffle": True} if pack_events else {}
         for name, dtype in _COLUMNS.items():
-            self._file.create_dataset(
-                f"events/{name}", (0,), dtype, maxshape=(None,), chunks=(H5_CHUNK,), compression="gzip",
-                compression_opts=1, shuffle=True,
-            )  # fmt: skip
+            self._file.create_dataset(f"events/{name}", (0,), dtype, maxshape=(None,), chunks=(H5_CHUNK,), **packed)
         self._file.create_group("images")
         self.written: Written | None = None
 
@@ -140,14 +168,9 @@ class RecordingWriter:
     ) -> None:
         if kind is not None:
             self._files.__exit__(kind, error, trace)
-            self._disk.check()  # what could not be written cannot be read back either
             return
         with self._files:
-            try:
-                self.written = self._finish()
-                self._file.close()
-            finally:
-                self._disk.check()
+            self.written = self._finish()
 
     def add(self, item: Item) -> None:
         """Add the next item of the recording.
@@ -171,10 +194,11 @@ class RecordingWriter:
         elif isinstance(item, Picture):
             self._add_picture(item)
         elif isinstance(item, FlowField):
-            name = f"flow/flow{self._flow_fields:09d}"
-            dataset = self._file.create_dataset(name, data=item.flow, compression="gzip", compression_opts=1)
-            dataset.attrs["timestamp"] = (item.t_ns - self._set_origin(item.t_ns)) * 1e-9
-            self._flow_fields += 1
+            # event_flow pairs a field with the time at which it ends, and passes over the first one.
+            before = np.zeros_like(item.flow) if self._flow is None else self._flow
+            self.add_plane(f"flow_dt1/flow{self._flow_fields:09d}", item.t_ns, before)
+            self.add_plane(f"flow/flow{self._flow_fields:09d}", item.t_ns, item.flow)
+            self._flow, self._flow_fields = item.flow, self._flow_fields + 1
         elif len(item):
             self._set_origin(int(item.t_ns[0]))
             self._pending.append(item)
@@ -188,14 +212,17 @@ class RecordingWriter:
         if self._picture_size not in (None, size):
             raise UsageError(f"{self._source}: pictures of different sizes, {self._picture_size} and {size}")
         self._picture_size = size
-        origin_ns = self._set_origin(picture.t_ns)
-        dataset = self._file.create_dataset(
-            layout.image_key(len(self._picture_times)), data=picture.pixels, compression="gzip", compression_opts=1
-        )
-        dataset.attrs["timestamp"] = (picture.t_ns - origin_ns) * 1e-9
+        dataset = self.add_plane(layout.image_key(len(self._picture_times)), picture.t_ns, picture.pixels)
         if picture.published_event_index is not None:
             dataset.attrs["event_idx_published"] = picture.published_event_index
         self._picture_times.append(picture.t_ns)
+
+    def add_plane(self, name: str, t_ns: int, plane: npt.NDArray[Any]) -> h5py.Dataset:
+        """Write a dataset, [H, W] or [2, H, W], with a time of the recording's clock, and return it."""
+        self._disk.check()
+        dataset = self._file.create_dataset(name, data=plane, compression="gzip", compression_opts=1)
+        dataset.attrs["timestamp"] = (t_ns - self._set_origin(t_ns)) * 1e-9
+        return dataset
 
     def _set_origin(self, t_ns: int) -> int:
         """Return the time that becomes 0: that of the first item of any kind."""
@@ -240,7 +267,7 @@ class RecordingWriter:
     def _finish(self) -> Written:
         if self._pending:
             self._flush(keep=0)
-        if not self._events or self._origin_ns is None or self._last_ns is None:
+        if self._origin_ns is None or not (self._events or self._may_be_empty):
             raise UsageError(f"{self._source} has no events")
         size = self._size or self._picture_size or self._largest.require_usable(self._source)
         if self._picture_size not in (None, size):
@@ -252,13 +279,13 @@ class RecordingWriter:
             )
         self._pair_pictures()
         ts = self._file["events/ts"]
-        seconds = float(ts[-1] - ts[0])
+        first, last = (float(ts[0]), float(ts[-1])) if self._events else (0.0, 0.0)
         self._file.attrs.update(
             sensor_resolution=(size.height, size.width),
             num_events=self._events,
             num_imgs=len(self._picture_times),
-            t0=float(ts[0]),
-            duration=seconds,
+            t0=first,
+            duration=last - first,
             data_source=self._source,
             start_ns=self._origin_ns,
         )
@@ -267,7 +294,7 @@ class RecordingWriter:
         return Written(
             events=self._events,
             images=len(self._picture_times),
-            seconds=seconds,
+            seconds=last - first,
             reordered_events=self._reordered,
             backward_images=int(np.count_nonzero(np.diff(self._picture_times) <= 0)),
             size=size,
@@ -280,7 +307,7 @@ class RecordingWriter:
         ts = self._file["events/ts"]
         times = np.array([self._file[layout.image_key(i)].attrs["timestamp"] for i in range(len(self._picture_times))])
         earlier = np.zeros(len(times), np.int64)
-        for start in range(0, self._events, FLUSH_EVENTS):
+        for start in range(0, self._events if len(times) else 0, FLUSH_EVENTS):
             earlier += np.searchsorted(ts[start : start + FLUSH_EVENTS], times, side="left")
         for index, count in enumerate(earlier):
             attributes = self._file[layout.image_key(index)].attrs
