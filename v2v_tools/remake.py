@@ -44,6 +44,7 @@ class Remaker:
         quarantine, snapshot: the quarantine and the snapshot to make them under; the empty one by default.
 
     Attributes:
+        catalogue, spec: as given.
         count: samples of an epoch.
 
     Raises:
@@ -61,7 +62,7 @@ class Remaker:
     ) -> None:
         array_layout(spec.recipe, spec.voxel_dtype, arrays)
         catalogue.facts.require_arrays(arrays)
-        self._catalogue, self._spec, self._arrays = catalogue, spec, arrays
+        self.catalogue, self.spec, self._arrays = catalogue, spec, arrays
         self._quarantine, self._snapshot = quarantine or Quarantine(), snapshot
         table = SequenceTable(catalogue.videos, catalogue.rows, spec)
         if not table.count:
@@ -69,9 +70,20 @@ class Remaker:
         self._schedule = Schedule(table, spec)
         self.count = self._schedule.count
 
-    def sequence(self, seed: int, epoch: int, index: int) -> VideoSequence:
-        """Return the sequence that the sample of this name is made from if it can be read."""
-        return self._schedule.candidate(seed, epoch, index, 0)
+    def job(self, seed: int, epoch: int, index: int) -> SampleJob:
+        """Return the job of the sample of this name, from the video that it is made of if that can be read.
+
+        Raises:
+            IndexUnreadable, V2VError: see :func:`lease_for`.
+        """
+        return self._job(seed, Request(b"", epoch, index), self._schedule.candidate(seed, epoch, index, 0))
+
+    def _job(self, seed: int, request: Request, sequence: VideoSequence) -> SampleJob:
+        return SampleJob.of(
+            lease_for(
+                request, sequence=sequence, catalogue=self.catalogue, spec=self.spec, seed=seed, arrays=self._arrays
+            )
+        )
 
     def sample(self, seed: int, epoch: int, index: int) -> Sample:
         """Make the sample of this name, candidates and refusals included: see :meth:`made`."""
@@ -91,7 +103,7 @@ class Remaker:
             SidecarError: a file beside the video, which an array is made from, cannot be used.
             VideoUnreadable: this host cannot read a candidate's file, which a server may have read.
         """
-        catalogue, spec = self._catalogue, self._spec
+        catalogue, spec = self.catalogue, self.spec
         SampleId(spec.digest, catalogue.facts.digest_under(spec.scene), 0, seed, epoch, index)
         if index >= self.count:
             raise UsageError(f"index {index}: the epoch has {counted(self.count, 'sample')}, 0 .. {self.count - 1}")
@@ -106,12 +118,9 @@ class Remaker:
             if condemned is not None:
                 request = next_candidate(request, Refusal(video.id, None, condemned, RefusalKind.QUARANTINED))
                 continue
-            lease = lease_for(
-                request, sequence=sequence, catalogue=catalogue, spec=spec, seed=seed, arrays=self._arrays
-            )
-            job = SampleJob.of(lease)
+            job = self._job(seed, request, sequence)
             try:
-                decoded = decode_for(job.clip, lease.indices, catalogue.source)[0]
+                decoded = decode_for(job.clip, (index,), catalogue.source)[0]
                 with open_sidecars(job.clip, catalogue.source) as sidecars:
                     return RemadeSample(job, decoded, make_sample(job, decoded, sidecars=sidecars))
             except VideoError as error:

@@ -32,7 +32,7 @@ if __name__ == "__main__":
         remaker = Remaker(catalogue, spec)
         gc.collect()
         open("/proc/self/clear_refs", "w").write("5")
-        video = remaker.made(0, 0, 0) and remaker.sequence(0, 0, 0).video
+        video = remaker.made(0, 0, 0) and catalogue.videos[0]
         status = dict(line.split(":", 1) for line in open("/proc/self/status"))
         arrays = layout_bytes(array_layout(spec.recipe, spec.voxel_dtype, DEFAULT_ARRAYS))
         print(lease_bytes(video, catalogue.rows, spec, arrays), 1024 * int(status["VmHWM"].split()[0]))

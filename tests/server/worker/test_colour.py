@@ -33,6 +33,7 @@ from v2v_server.corpus.scenes import picture_check
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.corpus_words import notes_of
 from v2v_server.prepare import prepare
+from v2v_server.schedule import VideoSequence
 from v2v_server.simulation.intensity import light_table
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.planes.detail import detail_of, levels_of
@@ -255,8 +256,9 @@ def test_deep_clips_offline(tmp_path: Path) -> None:
     spec = StreamSpec(recipe=DECLARED)
     with closing(open_catalogue(tmp_path / "clips", processes=0)) as catalogue:
         remaker = Remaker(catalogue, spec)
-        sample, sequence = remaker.sample(0, 0, 0), remaker.sequence(0, 0, 0)
-        whole = WholePictures(catalogue, spec).camera(sequence)
+        sample, job = remaker.sample(0, 0, 0), remaker.job(0, 0, 0)
+        whole = WholePictures(catalogue).camera(job)
+        sequence = VideoSequence(catalogue.videos[0], job.clip.start_frame)
         lease = lease_for(
             Request(b"", 0, 0), sequence=sequence, catalogue=catalogue, spec=spec, seed=0, arrays=DEFAULT_ARRAYS,
             siblings=(1,),
