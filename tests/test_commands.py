@@ -8,6 +8,7 @@ import re
 import shlex
 import sys
 import tomllib
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
 from importlib import import_module
@@ -49,8 +50,12 @@ _LAUNCHED = {
     "tests.tools.trace": "tests.tools.trace",
 }
 """What `python` and `torchrun` start beside benches."""
-_EXPORT = "v2v-train-export"
-"""`v2v-train export`, which has flags of its own."""
+_MODES = {
+    ("v2v-train", "export"): "trainer.run.export",
+    ("v2v-simulate", "--whole"): "v2v_tools.whole",
+    ("v2v-simulate", "--count"): "v2v_tools.sample_set",
+}
+"""Modules with the parser of a program that has other flags beside this word."""
 _STANDS_FOR_ANY = {"train.py": "the reader's own script"}
 PAGES = sorted(
     page
@@ -63,7 +68,7 @@ PAGES = sorted(
 )
 """Decisions and notes are of their day, and stay as they were."""
 _LINE = re.compile(r"\b(v2v[- ][a-z]+)((?: [^\n`|;&#)]*)?)")
-_FLAG = re.compile(r"(?<=\s)(--[a-z][a-z-]*)")
+_WORD = re.compile(r"(?<=\s)(--[a-z][a-z-]*|export)")
 
 
 class _Caught(Exception):
@@ -89,17 +94,21 @@ def parser_of(module: str) -> argparse.ArgumentParser:
     return found[0]
 
 
-def flags_of(program: str) -> frozenset[str]:
-    """Return all flags that the program's own parser knows."""
-    module = "trainer.run.export" if program == _EXPORT else MODULES[program]
-    return frozenset(parser_of(module)._option_string_actions)
+def module_of(program: str, words: Sequence[str] = ()) -> str:
+    """Return the module whose parser reads these words."""
+    return next((_MODES[program, word] for word in words if (program, word) in _MODES), MODULES[program])
+
+
+def flags_of(program: str, words: Sequence[str] = ()) -> frozenset[str]:
+    """Return all flags that the program knows beside these words."""
+    return frozenset(parser_of(module_of(program, words))._option_string_actions)
 
 
 def command_lines(text: str) -> list[tuple[str, list[str]]]:
-    """Yield (program, its flags) for each command line in a text. A backslash at the end continues a line."""
+    """Yield (program, its words) for each command line in a text. A backslash at the end continues a line."""
     joined = re.sub(r"\\\n\s*#?\s*", " ", text)
     return [
-        (_EXPORT if (program, rest.split()[:1]) == ("v2v-train", ["export"]) else program, _FLAG.findall(rest))
+        (program, _WORD.findall(rest))
         for said, rest in _LINE.findall(joined)
         if (program := said.replace(" ", "-")) in MODULES
     ]
@@ -119,10 +128,10 @@ def test_every_program_is_checked() -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_shown_flags_exist(page: Path) -> None:
     wrong = [
-        f"{program} {flag}"
-        for program, flags in command_lines(page.read_text(encoding="utf-8"))
-        for flag in flags
-        if flag not in flags_of(program)
+        f"{program} {word}"
+        for program, words in command_lines(page.read_text(encoding="utf-8"))
+        for word in words
+        if word[0] == "-" and word not in flags_of(program, words)
     ]
     assert wrong == []
 
@@ -133,9 +142,9 @@ def test_images_start_programs_with_valid_flags() -> None:
         *re.findall(r"command: (\[\"--.*\])$", (ROOT / "deploy" / "compose.yaml").read_text(), re.M),
     ]
     assert len(lists) == 3
-    assert set(_FLAG.findall(" ".join(lists).replace('"', " "))) <= flags_of("v2v-serve")
+    assert set(_WORD.findall(" ".join(lists).replace('"', " "))) <= flags_of("v2v-serve")
     (train,) = re.findall(r"command: (\[\"\$.*\])$", (ROOT / "deploy" / "compose.yaml").read_text(), re.M)
-    assert set(_FLAG.findall(train.replace('"', " "))) <= flags_of("v2v-train")
+    assert set(_WORD.findall(train.replace('"', " "))) <= flags_of("v2v-train")
 
 
 def block_lines(text: str) -> list[list[str]]:
@@ -167,9 +176,9 @@ def wrong_with(words: list[str]) -> str:
         return f"there is no {missing}" if missing else ""
     if program in ("python", "torchrun"):
         return _wrong_with_launched(rest)
-    if (program, rest[:1]) == ("v2v-train", ["export"]):
-        return _refused(parser_of("trainer.run.export"), rest[1:])
-    return _refused(parser_of(MODULES[program]), rest) if program in MODULES else "no program"
+    if program not in MODULES:
+        return "no program"
+    return _refused(parser_of(module_of(program, rest)), [word for word in rest if word != "export"])
 
 
 def _wrong_with_launched(words: list[str]) -> str:
@@ -225,7 +234,7 @@ def test_faulty_command_lines_are_detected() -> None:
         assert wrong_with(shlex.split(line)), line
 
 
-BARE = re.compile(r"`(--[a-z][a-z-]*)[^`]*`")
+BARE = re.compile(r"`(--[a-z][a-z-]*)(?![a-z_-])[^`]*`")
 PROGRAM = re.compile(r"`(v2v-[a-z]+)[ `]")
 
 OF_OTHERS = {"--constraint": "pip", "--profile": "docker compose", "--standalone": "torchrun", "--shm-size": "docker"}
@@ -236,5 +245,5 @@ def test_programs_and_flags_named_in_prose_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     assert set(PROGRAM.findall(text)) <= {*MODULES, "v2v-stream", "v2v-workers"}
     named = set(BARE.findall(text)) - set(OF_OTHERS)
-    parsers = [*map(parser_of, (*MODULES.values(), "trainer.run.export")), *map(parser_for, BENCHES)]
+    parsers = [*map(parser_of, (*MODULES.values(), *_MODES.values())), *map(parser_for, BENCHES)]
     assert named <= {flag for parser in parsers for flag in parser._option_string_actions}

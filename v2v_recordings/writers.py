@@ -20,7 +20,7 @@ from typing import IO, Any, ClassVar, NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList
 from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_recordings.archive import package
@@ -96,8 +96,7 @@ class EventWriter:
 
     Raises:
         UsageError: events step back, or are outside of the picture or the form's times; a plane has another shape, or
-            was not announced.
-        V2VError: the file cannot be written further, for instance on a full disk.
+            was not announced; or the file cannot be written further, for instance on a full disk.
     """
 
     def __init__(self, path: Path, form: str, size: tuple[int, int], planes: Sequence[str], source: str) -> None:
@@ -150,7 +149,7 @@ class EventWriter:
         """Add a picture of a kind of PLANES: images and masks uint8 [H, W], flow [2, H, W] px until the next field.
 
         Raises:
-            UsageError, V2VError: see :class:`EventWriter`.
+            UsageError: see :class:`EventWriter`.
         """
         if kind not in self._planes:
             raise UsageError(f"{self._path}: {kind} were not announced when it was opened: name them in planes")
@@ -212,7 +211,7 @@ class EventWriter:
             with late_signals():
                 yield
         except (OSError, RuntimeError) as error:  # the latter is faery's, for instance for a full disk
-            raise V2VError(f"{self._path}: cannot be written: {getattr(error, 'strerror', None) or error}") from error
+            raise UsageError(f"{self._path}: cannot be written: {getattr(error, 'strerror', None) or error}") from error
 
     def _aside(self) -> Path:
         return self._files.enter_context(write_aside_and_rename(self._path))
