@@ -48,9 +48,11 @@ def open_writer(
         source: name of the maker, for forms that keep it.
 
     Raises:
-        UsageError: see :func:`check_form`; or the file cannot be created.
+        UsageError: see :func:`check_form`; ``path`` is a folder that holds something; or the file cannot be created.
     """
     check_form(path, form, size, planes)
+    if path.is_dir() and (form != "evreal" or any(path.iterdir())):
+        raise UsageError(f"{path} is a folder, and is not replaced: give another name, or remove it")
     return EVENT_FORMS[form].writer(path, form, size, planes, source)
 
 
@@ -58,7 +60,7 @@ def check_form(path: Path, form: str, size: tuple[int, int], planes: Sequence[st
     """Check, before any work, that a form can hold pictures of this size and these planes.
 
     Raises:
-        UsageError: it cannot, a package is missing, or ``path`` is a folder that holds something.
+        UsageError: it cannot, or a package is missing.
     """
     if form not in EVENT_FORMS:
         raise UsageError(f"{path}: unknown form {form!r} of events; give one of {', '.join(EVENT_FORMS)}")
@@ -68,8 +70,6 @@ def check_form(path: Path, form: str, size: tuple[int, int], planes: Sequence[st
     check_size(str(path), chosen.limit, *size, f"give a smaller crop, or another form: {others}")
     if missing := [name for name in planes if name not in chosen.planes]:
         raise UsageError(f"{path}: {form} holds no {' or '.join(missing)}; give another form: {others}")
-    if path.is_dir() and (form != "evreal" or any(path.iterdir())):
-        raise UsageError(f"{path} is a folder, and is not replaced: give another name, or remove it")
     if chosen.package:
         package(chosen.package, str(path))
 

@@ -68,20 +68,31 @@ def test_what_is_read_and_simulated_at_a_time_changes_no_event(tmp_path: Path, m
     np.testing.assert_allclose(stamps, 0.04 * np.arange(40), atol=1e-9)
 
 
+def content(recording: Path) -> dict[str, tuple[int, bytes]]:
+    """Return time of change and bytes of each file of a recording."""
+    paths = recording.iterdir() if recording.is_dir() else [recording]
+    return {path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in paths}
+
+
 @SLOW
-def test_a_second_start_makes_what_is_missing_and_refuses_other_settings(tmp_path: Path, capfd: Any) -> None:
+@pytest.mark.parametrize(("form", "ending"), [("raw", ".raw"), ("evreal", "")])
+def test_a_second_start_makes_what_is_missing_and_refuses_other_settings(
+    form: str, ending: str, tmp_path: Path, capfd: Any
+) -> None:
     videos, out = write_panned(tmp_path / "videos", 2, 12), tmp_path / "out"
-    assert simulate(videos, out, form="raw") == 0
+    assert simulate(videos, out, form=form) == 0
     made = files(out)
-    assert len(made) == 4
-    first, second = sorted(path for path in out.glob("*.raw"))
-    before = first.stat().st_mtime_ns, second.read_bytes()
-    second.unlink()
+    first, second = (out / f"{path.name}{ending}" for path in sorted(videos.iterdir()))
+    before, again = content(first), content(second)
+    shutil.rmtree(second) if second.is_dir() else second.unlink()
     capfd.readouterr()
-    assert simulate(videos, out, form="raw") == 0
+    assert simulate(videos, out, form=form) == 0
     assert "1 video of 2 complete already" in capfd.readouterr().out
-    assert (first.stat().st_mtime_ns, second.read_bytes()) == before
-    assert simulate(videos, out, "--seed", "1", form="raw") == 2
+    assert content(first) == before
+    assert {name: data for name, (_, data) in content(second).items()} == {
+        name: data for name, (_, data) in again.items()
+    }
+    assert simulate(videos, out, "--seed", "1", form=form) == 2
     assert "made with other settings" in capfd.readouterr().err
     assert files(out) == made
 
