@@ -38,7 +38,7 @@ CANNOT = {
     r"^v2v-(serve|tradeoff) .*my_camera": "a recipe that v2v-fit writes",
     r"^v2v-convert ": "recordings that may not be redistributed",
     r"^v2v-eval ": "weights and recordings that may not be redistributed; the trainer's tests use synthetic ones",
-    r"^v2v-train (e2vid |firenet-cpu|my\.yaml )": "weights of LPIPS, or the reader's own file",
+    r"^v2v-train (e2vid |export |firenet-cpu|my\.yaml )": "weights of LPIPS, a finished training, a file of one's own",
     r"^v2v-serve .*--page": "a port that may be in use; tests of the page start it on a free one",
     r"^v2v-serve .*s3://": "another owner's bucket; tests/stream/test_object_storage.py starts it on its own",
 }
