@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import shutil
@@ -70,6 +71,11 @@ def test_what_the_image_of_the_server_installs_starts_and_serves(compiled: None,
             stream = V2VStreamDataset(port.read_text().strip(), 1, recipe=SMALL, timeout_seconds=300.0, insecure=True)
             with stream:
                 assert next(iter(stream)).indices
+            (line,) = instructions("Dockerfile", "HEALTHCHECK")
+            check = json.loads(line[line.index("[") :].replace("5555", port.read_text().rpartition(":")[2].strip()))
+            healthy = [programs / check[0], *check[1:]]
+            subprocess.run(healthy, check=True)
         finally:
             server.terminate()
     assert server.returncode == -15 or server.returncode == 0
+    assert subprocess.run(healthy, capture_output=True, check=False).returncode == 1
