@@ -59,8 +59,8 @@ PROTOCOL_MAY = {*sys.stdlib_module_names, "numpy", "msgpack", "v2v_protocol"}
 
 
 FLOORS = (
-    "system", "keys", "video", "simulation", "labels", "motion", "flow", "worlds", "store", "kinds", "config", "corpus",
-    "lease_memory", "corpus_words", "schedule",
+    "system", "keys", "video", "simulation", "labels", "motion", "flow", "worlds", "recorded", "store", "kinds",
+    "config", "corpus", "lease_memory", "corpus_words", "schedule",
     "quarantine", "sharing",
     "broker",
     "worker", "supervise", "status", "prepare", "page",

@@ -178,6 +178,14 @@ PRESET_FIELDS: Mapping[str, Mapping[str, Any]] = {
         "hot_pixel_share": (0.0, 5e-4),  # a guess, as davis346
         "hot_pixel_sigma": (0.0, 20.0),
     },
+    # Recordings of event cameras, which have their own noise: a grid from each mark to the next.
+    "recordings": {
+        "grids_per_frame": 1,
+        "noise_sigma": (0.0, 0.0),
+        "hot_pixel_share": (0.0, 0.0),
+        "hot_pixel_sigma": (0.0, 0.0),
+        "pause_probability": 0.0,
+    },
     # Photographs that move, for the paper's pixel: from a tripod to a run, up to 7 px from frame to frame at 60 Hz.
     "worlds": {
         "world_speed_px": (4.0, 400.0),
@@ -199,6 +207,7 @@ STREAM_PRESETS: Mapping[str, Mapping[str, Any]] = {
     "fast": {"samples_per_decode": 4},
     "natural": {"samples_per_decode": 1, "scene": "auto", "moving_share": 0.75},
     "worlds": {"samples_per_decode": 1, "recipe": "worlds"},
+    "recordings": {"samples_per_decode": 1, "recipe": "recordings"},
     "natural-davis346": {
         "samples_per_decode": 1, "scene": "auto", "moving_share": 0.75, "recipe": "davis346-running",
     },
@@ -206,7 +215,7 @@ STREAM_PRESETS: Mapping[str, Mapping[str, Any]] = {
 """Spec fields that each preset sets; a recipe by its name. The first three trade accuracy for speed
 (`docs/accuracy.md`); "natural" is for videos as they are: what spoils events is left out, and most crops show something
 that moves (`docs/scene.md`); "natural-davis346" shows them to a running camera (`docs/effects.md`); "worlds" is for
-photographs.
+photographs, "recordings" for recordings of event cameras.
 """
 
 
@@ -221,6 +230,9 @@ LARGEST_SCALE = 100.0
 EFFECTS_SECTION = "Effects beyond the paper's model; zero is off"
 """The group of fields that switch on an effect where the upper end of their range is above zero."""
 WORLDS_SECTION = "Worlds: photographs that move (--videos-kind photographs)"
+RECORDED_SECTION = "Recordings of event cameras (--videos-kind recordings)"
+ADDED = "added_sigma", "added_hot_share", "added_hot_sigma"
+"""Fields of the noise that is added to finished bins."""
 TIME_UNITS = ("Hz", "s")
 """An effect in one of these needs the time between frames."""
 STARTS = ("uniform", "triangular", "zero")
@@ -452,6 +464,21 @@ class Recipe(Persisted):
     )
     track_points: int = whole(64, 1, 65_536, "N, points that the array tracks follows", is_later=True)
 
+    bin_span: str = word(
+        "grid", ("grid", "events"),
+        "bins of a grid are equal parts of its time; events: of the time from its first event to its last, as in the "
+        "released code",
+        is_later=True, group=RECORDED_SECTION,
+    )  # fmt: skip
+    added_sigma: Range = span(
+        (0.0, 0.0), 0.0, 1e6, "standard deviation of noise that is added to every finished bin, events", is_later=True
+    )
+    added_hot_share: Range = span(
+        (0.0, 0.0), 0.0, 1.0, "share of the crop's pixels whose finished bins all get the same value added",
+        is_later=True,
+    )  # fmt: skip
+    added_hot_sigma: Range = span((0.0, 0.0), 0.0, 1e6, "standard deviation of that value, events", is_later=True)
+
     def __post_init__(self) -> None:
         check_settings(self, "recipe {}".format, RecipeError)
         if self.grids_per_frame and self.frames_per_bin != 1:
@@ -498,6 +525,16 @@ class Recipe(Persisted):
             for name, setting in settings_of(Recipe).items()
             if name.startswith("world_")
         )
+
+    @property
+    def is_recorded(self) -> bool:
+        """Return whether a field is set that only recordings can obey."""
+        return self.bin_span != "grid" or self.is_noisy
+
+    @property
+    def is_noisy(self) -> bool:
+        """Return whether noise may be added to finished bins."""
+        return any(any(getattr(self, name)) for name in ADDED)
 
     @property
     def timed_effects(self) -> bool:

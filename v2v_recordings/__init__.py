@@ -12,6 +12,7 @@ faery_reader.py  aedat4, Event Stream, by the package faery
 prophesee.py     EVT 2, EVT 3, DAT
 evt3.py          words of EVT 3 decoded and encoded
 writers.py       a writer for each form, which takes events and pictures piece by piece
+ordered.py       sorts events that arrive slightly late
 layout.py        the h5 layout of this project's recordings; layout_writer.py writes it from items of any reader
 late_signals.py  Ctrl-C between two writes, not within one
 limits.py        sizes and times that each form can hold

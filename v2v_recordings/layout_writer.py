@@ -1,7 +1,7 @@
 """Write the h5 layout in one pass, with bounded memory.
 
-Events pass through a buffer of FLUSH_EVENTS + REORDER_EVENTS, which sorts events that arrive slightly late. Only the
-times of pictures are kept in memory. The event of each picture is found at the end, in one pass over the event times on
+Events that arrive slightly late are sorted (:mod:`v2v_recordings.ordered`). Only the times of pictures are kept in
+memory. The event of each picture is found at the end, in one pass over the event times on
 disk, so pictures may come before or after their events.
 
     event_idx = number of events earlier than the picture     (events[event_idx] is the first one at its time or later)
@@ -27,9 +27,8 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_recordings import layout
 from v2v_recordings.items import EventChunk, FlowField, Item, Light, Note, Picture, SensorSize
+from v2v_recordings.ordered import FLUSH_EVENTS, InOrder
 
-FLUSH_EVENTS = 1 << 19
-REORDER_EVENTS = 1 << 17
 H5_CHUNK = 1 << 16
 _COLUMNS = {"ts": np.float64, "xs": np.uint16, "ys": np.uint16, "ps": np.bool_}
 
@@ -136,17 +135,15 @@ class RecordingWriter:
     ) -> None:
         self._files = contextlib.ExitStack()
         self._source, self._size, self._published_shift = source, size, published_shift
-        self._pending: list[EventChunk] = []
-        self._pending_events = 0
+        self._ordered = InOrder(source)
         self._origin_ns = origin_ns
         self._may_be_empty = origin_ns is not None
-        self._last_ns: int | None = None
         self._largest = SensorSize(0, 0)
         self._notes: list[str] = []
         self._light: Light | None = None
         self._picture_size: SensorSize | None = None
         self._picture_times: list[int] = []
-        self._events = self._reordered = self._flow_fields = 0
+        self._events = self._flow_fields = 0
         self._flow: npt.NDArray[np.float32] | None = None
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -201,10 +198,8 @@ class RecordingWriter:
             self._flow, self._flow_fields = item.flow, self._flow_fields + 1
         elif len(item):
             self._set_origin(int(item.t_ns[0]))
-            self._pending.append(item)
-            self._pending_events += len(item)
-            if self._pending_events >= FLUSH_EVENTS + REORDER_EVENTS:
-                self._flush(keep=REORDER_EVENTS)
+            for events in self._ordered.add(item):
+                self._append(events)
 
     def _add_picture(self, picture: Picture) -> None:
         height, width = picture.pixels.shape
@@ -230,23 +225,6 @@ class RecordingWriter:
             self._origin_ns = t_ns
         return self._origin_ns
 
-    def _flush(self, keep: int) -> None:
-        """Write all pending events except the last ``keep``."""
-        events = EventChunk.join(self._pending)
-        if backward := int(np.count_nonzero(np.diff(events.t_ns) < 0)):
-            events = events.take(np.argsort(events.t_ns, kind="stable"))
-        if self._last_ns is not None and events.t_ns[0] < self._last_ns:
-            seconds = (self._last_ns - events.t_ns[0]) * 1e-9
-            raise UsageError(
-                f"{self._source}: near event {self._events} the time goes back by {seconds:.6f} s over more than "
-                f"{REORDER_EVENTS} events; sort the recording, or split it there"
-            )
-        self._reordered += backward
-        count = len(events) - keep
-        self._append(events.part(0, count))
-        # A copy: a view would keep the whole buffer alive.
-        self._pending, self._pending_events = [events.take(np.arange(count, len(events)))], keep
-
     def _append(self, events: EventChunk) -> None:
         x, y = events.x, events.y
         if min(x.min(), y.min()) < 0 or max(x.max(), y.max()) > np.iinfo(np.uint16).max:
@@ -262,11 +240,10 @@ class RecordingWriter:
             dataset.resize(self._events + len(events), axis=0)
             dataset[self._events :] = values
         self._events += len(events)
-        self._last_ns = int(events.t_ns[-1])
 
     def _finish(self) -> Written:
-        if self._pending:
-            self._flush(keep=0)
+        for events in self._ordered.end():
+            self._append(events)
         if self._origin_ns is None or not (self._events or self._may_be_empty):
             raise UsageError(f"{self._source} has no events")
         size = self._size or self._picture_size or self._largest.require_usable(self._source)
@@ -295,7 +272,7 @@ class RecordingWriter:
             events=self._events,
             images=len(self._picture_times),
             seconds=last - first,
-            reordered_events=self._reordered,
+            reordered_events=self._ordered.reordered,
             backward_images=int(np.count_nonzero(np.diff(self._picture_times) <= 0)),
             size=size,
             size_is_guessed=self._size is None and self._picture_size is None,

@@ -111,6 +111,16 @@ def _columns(videos: _Videos) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int
     return frames, sizes, SplitVideos.of(pieces) if len(pieces) == len(videos) else None
 
 
+def require_suitable(videos: _Videos, spec: StreamSpec) -> None:
+    """Check that samples of a spec can be made of such videos.
+
+    Raises:
+        UsageError: they cannot.
+    """
+    if why := (kind_of(videos[0].id) if len(videos) else VIDEOS).refuses(spec):
+        raise UsageError(why)
+
+
 class SequenceTable:
     """All sequences of a corpus under one spec, in catalogue order, looked up by rank.
 
@@ -134,8 +144,7 @@ class SequenceTable:
 
     def __init__(self, videos: _Videos, rows: Rows, spec: StreamSpec, columns: Columns | None = None) -> None:
         self._all, self._rows, self._spec, self._columns = videos, rows, spec, columns or Columns(videos)
-        if why := (kind_of(videos[0].id) if len(videos) else VIDEOS).refuses(spec):
-            raise UsageError(why)
+        require_suitable(videos, spec)
         if spec.scene != "off" and self._columns.split is None:
             raise UsageError(
                 f'scene = "{spec.scene}" needs statistics of the videos, which this catalogue was opened without: '

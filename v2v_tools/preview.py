@@ -146,7 +146,8 @@ def preview(
     _check_sizes(cameras, out.suffix.lower())
     for note, titles in notes.items():
         say(f"{', '.join(titles) if len(titles) < len(wanted) else 'all cameras'}: {note}")
-    say(f"{describe_start(started)} (recipe field start)")
+    if kind.is_simulated:
+        say(f"{describe_start(started)} (recipe field start)")
     if kind.has_motion:
         say(f"motion: {'; '.join(filter(None, describe_motion(together(moving), defects)))}")
     write_file(out, _content(out.suffix.lower(), whole, cameras, title, moments))

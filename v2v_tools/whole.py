@@ -107,6 +107,8 @@ def _run(asked: argparse.Namespace) -> int:
     """Make a recording of each video that has none; return the exit status."""
     spec = asked_spec(asked)
     kind = kind_from(vars(asked))
+    if not kind.is_simulated:
+        raise UsageError(f"--whole with {kind.name}: they have events of their own, in their raw files")
     if kind.is_view:
         raise UsageError("--whole with photographs: each sample has a path of its own; use --index without --whole")
     if asked.jobs < 1:

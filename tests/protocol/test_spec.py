@@ -43,6 +43,10 @@ OTHER_RECIPE_VALUES: dict[str, Any] = {
     "world_still_share": 0.1,
     "world_turn_only_share": 0.1,
     "world_plain_share": 0.1,
+    "bin_span": "events",
+    "added_sigma": [0.0, 0.1],
+    "added_hot_share": [0.0, 0.001],
+    "added_hot_sigma": [0.0, 0.1],
     "track_points": 32,
     "contrast_probability": 0.1,
     "contrast_scale": [1.0, 2.0],
@@ -99,6 +103,7 @@ PRESET_DIGESTS = {
     "davis346": "c52d5b5342fc135b5676b3a5116ece57",
     "davis346-running": "1de5b42d34b14b580736c38330ca12b3",
     "worlds": "71b398f70f04d63139ff2eb79b61849d",
+    "recordings": "b3dee5cae311f3e3b51e111a51b9bbac",
 }
 """No preset changes its meaning: new behaviour gets a new name."""
 

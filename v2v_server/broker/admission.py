@@ -16,7 +16,7 @@ from v2v_server.broker.leases import clean_name
 from v2v_server.broker.session import Session
 from v2v_server.broker.state import Broker
 from v2v_server.lease_memory import MOST_CLIP_BYTES
-from v2v_server.schedule import Schedule, SequenceTable
+from v2v_server.schedule import Schedule, SequenceTable, require_suitable
 
 MOST_BATCH_SIZE = 65_536
 MOST_CREDIT = 400
@@ -154,7 +154,6 @@ def _table(broker: Broker, spec: StreamSpec) -> SequenceTable:
         recipe.crop_width_px,
         recipe.resize_scale,
         recipe.light,
-        recipe.is_world,
         spec.flow_margin_px,
         spec.substep_px > 0.0,
         spec.voxel_dtype,
@@ -165,6 +164,7 @@ def _table(broker: Broker, spec: StreamSpec) -> SequenceTable:
         spec.quiet_share,
     )
     table = broker.tables.get(geometry)
+    require_suitable(broker.facts.videos, spec)
     if table is None:
         table = SequenceTable(broker.facts.videos, broker.facts.rows, spec, broker.columns)
         if not table.count:
