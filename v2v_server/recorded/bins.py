@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.recipe import Recipe
-from v2v_protocol.sample import ARRAYS, SampleParams
+from v2v_protocol.sample import SampleParams
 from v2v_server.recorded.blocks import PackedEvents
 from v2v_server.simulation import noise
 from v2v_server.simulation.pixel import hot_pixels, words
@@ -169,19 +169,3 @@ def _add_noise(params: SampleParams, flat: npt.NDArray[Any]) -> None:
     count = int(added["added_hot_share"] * flat.shape[1] + 0.5)
     position, normals = hot_pixels(params.noise_key, count, flat.shape[1])
     flat[:, position] += np.float32(added["added_hot_sigma"]) * normals
-
-
-def event_arrays(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return those of some arrays that are made of events by :func:`fill_arrays`."""
-    return tuple(name for name in names if ARRAYS[name].of_events is not None)
-
-
-def load() -> None:
-    """Load from numba's cache, or compile, what :func:`fill_arrays` runs."""
-    events = PackedEvents.of([0], [0], [0], [1])
-    latest, counts = np.zeros((2, 1), np.int64), np.zeros((2, 1, 1), np.int32)
-    shared, ages = np.zeros(counts.shape), np.zeros(counts.shape, np.float32)
-    for part in (slice(None), slice(0)):
-        _add_events(
-            *events, np.int64(0), np.int64(1), False, (0, 0, 1, 1), False, latest, counts, shared[part], ages[part]
-        )

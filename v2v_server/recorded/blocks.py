@@ -154,16 +154,6 @@ class EventFile(AbstractContextManager["EventFile"]):
         found = self._events(first, int(np.searchsorted(starts, end_ns, "left")))
         return found.part(*np.searchsorted(found.t_ns, (begin_ns, end_ns), "left").tolist())
 
-    def numbered(self, first: int, last: int) -> PackedEvents:
-        """Return the events number ``first`` to ``last`` - 1, as far as there are any."""
-        first, last = max(0, first), min(last, self.head.events)
-        if first >= last:
-            return NO_EVENTS
-        block = int(np.searchsorted(self.blocks["first"], first, "right")) - 1
-        found = self._events(block, int(np.searchsorted(self.blocks["first"], last, "left")))
-        before = int(self.blocks["first"][block])
-        return found.part(first - before, last - before)
-
     def times_of_every(self, events: int) -> npt.NDArray[np.int64]:
         """Return the time of the first of all events and of each ``events`` further, [n] nanoseconds."""
         found, wanted = list[npt.NDArray[np.int64]](), np.arange(0, self.head.events, events)

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.sample import RECORDING_FORMAT, array_layout, new_arrays
-from v2v_server.recorded.blocks import EventFile
+from v2v_protocol.sample import ARRAYS, RECORDING_FORMAT, array_layout, new_arrays
+from v2v_server.recorded.blocks import NO_EVENTS, EventFile
 from v2v_server.video.decode import ClipRequest, Cut, DecodedClip, DecodedPicture, SampleView
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.frame_index import LARGEST_FRAMES, unseekable
@@ -119,7 +119,7 @@ class RecordedPixels(EventFile):
         self, clip: DecodedClip, times: npt.NDArray[np.int64], usable: PixelRect, view: SampleView
     ) -> DecodedClip:
         """Return a clip with the arrays of a sample that are made of events, and true flow; ``times``: [n] marks."""
-        from v2v_server.recorded.bins import Grids, event_arrays, fill_arrays  # a catalogue must not load numba
+        from v2v_server.recorded.bins import Grids, fill_arrays  # a catalogue must not load numba
 
         recipe, params = view.spec.recipe, view.params
         ends = params.ends(recipe)
@@ -128,13 +128,11 @@ class RecordedPixels(EventFile):
         parts = np.arange(max(1, recipe.grids_per_frame) + 1)
         inner = edges[:-1, None] + np.diff(edges)[:, None] * parts // parts[-1]
         grids = Grids(inner[:, :-1].ravel(), inner[:, 1:].ravel())
-        asked = event_arrays(view.arrays), tuple(name for name in _FLOW if name in view.arrays and len(self.flows))
+        of_events = tuple(name for name in view.arrays if ARRAYS[name].of_events is not None)
+        asked = of_events, tuple(name for name in _FLOW if name in view.arrays and len(self.flows))
         arrays = new_arrays(array_layout(recipe, view.spec.voxel_dtype, asked[0] + asked[1]))
-        of_events = {name: arrays[name] for name in asked[0]}
-        saturated = {}
-        if of_events:
-            events = self.between(int(edges[0]), int(edges[-1]))
-            saturated = fill_arrays(events, grids, recipe, params, window, of_events)
+        events = self.between(int(edges[0]), int(edges[-1])) if of_events else NO_EVENTS
+        saturated = fill_arrays(events, grids, recipe, params, window, {name: arrays[name] for name in of_events})
         if asked[1]:
             why = self._fill_flow(edges[recipe.lead_voxels :], window, view, {name: arrays[name] for name in asked[1]})
         elif not np.isin(edges, self.pictures_table["t_ns"]).all():
