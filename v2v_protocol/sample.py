@@ -321,8 +321,8 @@ class Provenance(Persisted):
         boxes_dropped: boxes that ``max_boxes`` left out, in all frames of the sample.
         grid_seconds: actual duration of each voxel grid, where the recipe states ``voxel_seconds``.
         left_out: effects of the draw that were not simulated; only samples of earlier releases have any.
-        substeps: parts that the clip's steps were divided into along the motion, undivided steps included; 0: the spec
-            states no ``substep_px``, so no motion was used.
+        substeps: parts that the clip's steps were divided into, undivided steps included; 0: the spec divides none
+            (``substep_px``, ``world_change_share``).
         remark: what of the video is not served, or served with wrong grey levels or times; empty for most.
         dropped: as ``boxes_dropped``, for other labels by name; only those that have any.
     """

@@ -156,7 +156,7 @@ def _table(broker: Broker, spec: StreamSpec) -> SequenceTable:
         recipe.light,
         recipe.is_world,
         spec.flow_margin_px,
-        spec.substep_px > 0.0,
+        spec.levels_per_step,
         spec.voxel_dtype,
         spec.max_sequences_per_video,
         spec.scene,

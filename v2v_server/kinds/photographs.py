@@ -85,7 +85,7 @@ class PhotographKind(VideosKind):
         }
 
     def reads(self, spec: StreamSpec, height_px: int, width_px: int) -> tuple[int, int]:
-        """Return the crop, which is rendered in 12 bits."""
+        """Return the crop, whose levels take two bytes."""
         return spec.recipe.crop_height_px * spec.recipe.crop_width_px, 2
 
     def variants(self, found: frozenset[Variant]) -> frozenset[Variant]:

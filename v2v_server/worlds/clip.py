@@ -12,15 +12,19 @@ import numpy.typing as npt
 from v2v_protocol.recipe import preset
 from v2v_protocol.sample import array_layout, new_arrays
 from v2v_protocol.spec import MOST_SUBSTEPS, StreamSpec
+from v2v_server.simulation.clip import intensity_of
 from v2v_server.simulation.draw import draw
+from v2v_server.simulation.intensity import log_table
 from v2v_server.simulation.view import apply_view, contrast_table
 from v2v_server.video.decode import BIT_EXACT_CODECS, DecodedClip, SampleView
-from v2v_server.video.picture import MOST_BITS, Signal
+from v2v_server.video.picture import Signal
 from v2v_server.worlds.render import (
     PhotoPyramid,
     flow_of,
     levels_between,
     masks_of,
+    parts_by_change,
+    parts_by_motion,
     pyramid_of,
     render,
     tracks_of,
@@ -57,13 +61,20 @@ def render_clip(
     )  # fmt: skip
     ends = params.ends(recipe)
     source = params.source_index(int(ends[-1]))
-    signal, seen = Signal(MOST_BITS), replace(params, scale=1.0)
-    levels = None
+    signal, seen = Signal(recipe.world_bits), replace(params, scale=1.0)
+    shown = contrast_table(params.contrast, signal.white) if params.contrast else None
+    parts = np.ones(len(seconds) - 1, np.int64)
     if spec.substep_px:
-        levels = levels_between(pyramid, world, seconds, source, spec.substep_px, MOST_SUBSTEPS)
-    if levels is not None and params.contrast:
-        table = contrast_table(params.contrast, signal.white)
-        levels = levels._replace(grey=np.stack([table[level] for level in levels.grey]))
+        parts = parts_by_motion(world, seconds, spec.substep_px, MOST_SUBSTEPS)
+    if recipe.world_change_share:
+        logs = log_table(*intensity_of(params, recipe, signal))
+        changes = np.stack([logs / np.float32(each) for each in (params.threshold_pos, params.threshold_neg)])
+        changes = changes if shown is None else changes[:, shown]
+        by_change = parts_by_change(pyramid, world, seconds, changes, recipe.world_change_share, MOST_SUBSTEPS)
+        parts = np.maximum(parts, by_change)
+    levels = levels_between(pyramid, world, seconds, source, parts)
+    if levels is not None and shown is not None:
+        levels = levels._replace(grey=np.stack([shown[level] for level in levels.grey]))
     frames = apply_view(render(pyramid, world, seconds), seen, recipe, signal)
     known = tuple(name for name in TRUTH if name in view.arrays)
     arrays = _truth(world, seconds[source[ends]], spec, known) if known else {}
