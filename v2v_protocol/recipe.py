@@ -265,6 +265,12 @@ class Recipe(Persisted):
     lead_frames: int = whole(0, 0, 1, "1 adds the frame before the first target frame (flow networks)")
     lead_voxels: int = whole(0, 0, 1, "1 adds one voxel grid before the first (ERAFT)")
     frame_stride: int = whole(1, 1, 1000, "use every n-th frame, as if the video had 1/n of its frame rate")
+    exposure_seconds: Range = span(
+        (0.0, 0.0), 1e-6, 10.0,
+        "exposure of frames_blurred, around the time of each frame; the events are those of the same light",
+        unit="s", off=True, is_later=True,
+        usual=(1e-5, 0.2), mistake="The picture would be exposed for {0:g} s. Divide milliseconds by 1000.",
+    )  # fmt: skip
     max_boxes: int = whole(
         64, 1, 4096, "most boxes of a frame, if boxes are requested; the smallest ones beyond it are left out",
         is_later=True,

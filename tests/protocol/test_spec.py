@@ -43,6 +43,7 @@ OTHER_RECIPE_VALUES: dict[str, Any] = {
     "world_still_share": 0.1,
     "world_turn_only_share": 0.1,
     "world_plain_share": 0.1,
+    "exposure_seconds": (0.001, 0.01),
     "world_bits": 16,
     "world_change_share": 0.5,
     "track_points": 32,

@@ -155,6 +155,7 @@ def _table(broker: Broker, spec: StreamSpec) -> SequenceTable:
         recipe.resize_scale,
         recipe.light,
         recipe.is_world,
+        recipe.exposure_seconds,
         spec.flow_margin_px,
         spec.levels_per_step,
         spec.voxel_dtype,
