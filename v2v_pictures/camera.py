@@ -121,7 +121,7 @@ class Camera:
 
     def picture(self, grid: int) -> npt.NDArray[np.uint8]:
         """Return the frame of a voxel grid, [H, W]; if it is known exposed too, that as its right half."""
-        picture = self.frames[grid].copy()
+        picture: npt.NDArray[np.uint8] = self.frames[grid].copy()
         if self.blurred is not None:
             half = picture.shape[1] // 2
             picture[:, half:] = self.blurred[grid, :, half:]

@@ -115,7 +115,8 @@ def parts_by_motion(world: World, seconds: Doubles, substep_px: float, most_part
     x, y = (part.ravel() for part in np.meshgrid(left + width * halves, top + height * halves))
     to_x, to_y = _taken(_inverse(places[1:])[0][:, :, None], *_taken(places[:-1, :, None], x, y))
     longest = np.sqrt(((to_x - x) * (to_x - x) + (to_y - y) * (to_y - y)).max(axis=(1, 2)))
-    return 1 + np.minimum(longest / substep_px, most_parts - 1).astype(np.int64)
+    more: npt.NDArray[np.int64] = np.minimum(longest / substep_px, most_parts - 1).astype(np.int64)
+    return more + 1
 
 
 def parts_by_change(
@@ -146,7 +147,8 @@ def parts_by_change(
     change = np.sort(np.maximum(brighter, -darker), axis=1)
     last = change.shape[1] - 1 - np.count_nonzero(change, axis=1) // _FASTEST_SHARE
     fastest = change[np.arange(len(change)), last] * np.float32(most_parts)
-    return np.clip(np.ceil(fastest / share), 1, most_parts).astype(np.int64)
+    parts: npt.NDArray[np.int64] = np.clip(np.ceil(fastest / share), 1, most_parts).astype(np.int64)
+    return parts
 
 
 def levels_between(
