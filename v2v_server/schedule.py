@@ -134,7 +134,8 @@ class SequenceTable:
 
     def __init__(self, videos: _Videos, rows: Rows, spec: StreamSpec, columns: Columns | None = None) -> None:
         self._all, self._rows, self._spec, self._columns = videos, rows, spec, columns or Columns(videos)
-        if why := (kind_of(videos[0].id) if len(videos) else VIDEOS).refuses(spec):
+        self._kind = kind_of(videos[0].id) if len(videos) else VIDEOS
+        if why := self._kind.refuses(spec):
             raise UsageError(why)
         if spec.scene != "off" and self._columns.split is None:
             raise UsageError(
@@ -212,6 +213,8 @@ class SequenceTable:
         strides = np.maximum(recipe.sequence_at(rates), 1)
         counts = np.clip((columns.frames[first:end] - 1) // strides, 0, spec.max_sequences_per_video)
         counts *= self._suits[size] & (recipe.reach_at(rates) <= self._most_steps[size] * recipe.frame_stride)
+        if least_hz := self._kind.least_hz(spec):
+            counts *= rates >= least_hz * (1.0 - 1e-6)
         if recipe.is_timed:
             steps = recipe.steps_at(rates)
             counts *= (steps > 0) & (steps <= MOST_STEPS_PER_GRID)

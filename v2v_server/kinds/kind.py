@@ -28,6 +28,8 @@ if TYPE_CHECKING:  # a command line starts without the decoder
 
 RATE = 0.0, 0.0, 1e6, "rate of picture sequences without time stamps, 0: unknown; of photographs, 0: 60"
 """What kinds of pictures without times of their own state of their flag ``rate``, in Hz."""
+LEAST_EXPOSED = 4
+"""Frames of a video that an exposure lasts at least."""
 _SUFFIX = re.compile(r"\.(?=.*[a-z]|26[45]$)[a-z0-9]+", re.IGNORECASE)
 
 
@@ -135,6 +137,11 @@ class VideosKind:
         if not spec.recipe.is_world:
             return ""
         return f"the recipe's world fields are for photographs, these are {self.name}: add --videos-kind photographs"
+
+    def least_hz(self, spec: StreamSpec) -> float:
+        """Return the least rate of such videos whose samples can be made under a spec, frames a second; 0 for any."""
+        exposure, stride = spec.recipe.exposure_seconds, spec.recipe.frame_stride
+        return LEAST_EXPOSED * stride / exposure[0] if any(exposure) else 0.0
 
     def cannot(self) -> Mapping[str, str]:
         """Return the arrays that no such video gives, with what they need, and what to ask for instead."""
