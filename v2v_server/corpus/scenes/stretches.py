@@ -15,12 +15,15 @@ Bars (letterbox, pillarbox): dark rows and columns at the sides of the picture t
 
 Repeats: the change of a step is the sum of the squared changes of the means of 8 x 8 blocks, of those that change by
 more than a grey level. Means of blocks hold little coder noise, and squares give most weight to moving edges. It is
-compared with the steps around it, up to four on either side.
+compared with the steps around it, up to four on either side. What swings or flickers has small steps too, where it
+turns. So a repeat is a step, or several, between two that are five times as large, after which the picture goes on: its
+change from the picture before those two steps is at least 3/4 of the larger one, and more than 9 times the small one.
+After a turn it comes back: three even steps about a turn lead at most three times as far as the one in the middle.
 
     pattern   A step is a repeat if its change is at most 1/5 (almost half of the amplitude) of the second largest
               around it: coders with few bits blend a repeat with its neighbours. A pattern is a period of 2 to 12
-              steps in which four fifths of the steps at some places are such repeats, and at most half at the other
-              places, in one shot.
+              steps in which four fifths of the steps at some places are such repeats, half of which the picture goes
+              on after, and at most half at the other places, in one shot.
     single    A step is a repeat if its change is at most 1/12 of that of each of the four steps before and after,
               unless the step before it is large: a coder with few bits repeats its keyframes, which look unlike the
               frames before them.
@@ -45,6 +48,8 @@ Spans = tuple[tuple[int, int], ...]
 _RATIO = 25
 _MEDIAN_RATIO = 6
 _PATTERN_RATIO = 5
+_TURN_RATIO = 9
+"""The square of the length of three even steps about a turn, as a multiple of that of the one in the middle."""
 _REACH = 4
 _CUT_REACH = 8
 _SURE_RATIO = 12
@@ -104,11 +109,34 @@ def change_of(before: npt.NDArray[np.int64], after: npt.NDArray[np.int64]) -> in
     return int(np.square(difference, where=np.abs(difference) > _NOISE, out=np.zeros_like(difference)).sum())
 
 
-def duplicated(changes: Sequence[int], blocks: int, boundaries: Sequence[int] = ()) -> npt.NDArray[np.bool_]:
+def steps_gone_on(blocks: Sequence[npt.NDArray[np.int64]], changes: Sequence[int]) -> int:
+    """Return the number of small steps before the last one that the picture goes on after, as after repeats.
+
+    Args:
+        blocks: [n][rows, columns], means of the blocks of the last pictures, 1/64 grey level.
+        changes: at least n - 1, those of the steps up to the last picture, (1/64 grey level)^2.
+
+    Returns:
+        0 if the picture comes back, or nothing is known of the step before the small ones.
+    """
+    count, most = 0, len(blocks) - 2
+    while count < most and _PATTERN_RATIO * changes[-2 - count] <= changes[-1]:
+        count += 1
+    if not 0 < count < most or changes[-1] < _LEAST_CHANGE * blocks[-1].size:
+        return 0
+    before, first, last, after = (blocks[at] for at in (-3 - count, -2 - count, -2, -1))
+    way, step = change_of(before, after), max(change_of(before, last), change_of(first, after))
+    return count if way > _TURN_RATIO * change_of(first, last) and 4 * way > 3 * step else 0
+
+
+def duplicated(
+    changes: Sequence[int], gone_on: npt.NDArray[np.bool_], blocks: int, boundaries: Sequence[int] = ()
+) -> npt.NDArray[np.bool_]:
     """Return which steps repeat a frame.
 
     Args:
         changes: [N] sums of squares, (1/64 grey level)^2.
+        gone_on: [N], whether :func:`steps_gone_on` counts the step.
         blocks: number of blocks in each sum.
         boundaries: frames at which another shot begins.
 
@@ -119,17 +147,18 @@ def duplicated(changes: Sequence[int], blocks: int, boundaries: Sequence[int] = 
     flags, others = np.zeros(len(each), bool), np.zeros(len(each), bool)
     for first, end in pairwise([0, *boundaries, len(each) + 1]):
         shot = slice(first, end - 1)  # the steps between its frames
-        pattern = _in_pattern(each[shot], least)
+        pattern = _in_pattern(each[shot], gone_on[shot], least)
         flags[shot] = pattern
         if not pattern.any():
             others[shot] = [_is_repeat(changes[shot], at, least) for at in range(end - 1 - first)]
         sure = [_is_surely_repeat(changes[shot], at, least) for at in range(end - 1 - first)]
-        flags[shot] |= np.array(sure, bool)
+        flags[shot] |= np.array(sure, bool) & gone_on[shot]
+    others &= gone_on
     count = int(others.sum())
     return flags | others if count >= _LEAST_COUNT and 1000 * count >= _LEAST_PER_MILLE * len(each) else flags
 
 
-def _in_pattern(changes: npt.NDArray[np.int64], least: int) -> npt.NDArray[np.bool_]:
+def _in_pattern(changes: npt.NDArray[np.int64], gone_on: npt.NDArray[np.bool_], least: int) -> npt.NDArray[np.bool_]:
     """Return which steps of a shot repeat a frame in a regular pattern."""
     count, none = len(changes), np.zeros(len(changes), bool)
     if not count:
@@ -139,11 +168,10 @@ def _in_pattern(changes: npt.NDArray[np.int64], least: int) -> npt.NDArray[np.bo
     moves = largest >= least
     small = moves & (_PATTERN_RATIO * changes <= largest)
     for period in range(2, min(_LONGEST_PERIOD, int(moves.sum()) // 4) + 1):
-        shares = [(int(small[place::period].sum()), int(moves[place::period].sum())) for place in range(period)]
-        repeats = [5 * found >= 4 * steps > 0 for found, steps in shares]
-        others = [2 * found <= steps for found, steps in shares]
-        enough = sum(found for (found, _), repeat in zip(shares, repeats, strict=True) if repeat) >= _LEAST_COUNT
-        if enough and any(others) and all(one or other for one, other in zip(repeats, others, strict=True)):
+        places = [[each[at::period].sum() for each in (small, small & gone_on, moves)] for at in range(period)]
+        found, sure, steps = np.array(places).T
+        repeats, others = (5 * found >= 4 * steps) & (steps > 0) & (2 * sure >= found), 2 * found <= steps
+        if found[repeats].sum() >= _LEAST_COUNT and others.any() and (repeats | others).all():
             pattern: npt.NDArray[np.bool_] = moves & np.resize(repeats, count)
             return pattern
     return none

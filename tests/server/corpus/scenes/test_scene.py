@@ -169,7 +169,7 @@ def test_encoding_and_slices(scene: Scene, data: st.DataObject) -> None:
 
 @given(st.binary(max_size=60))
 def test_what_is_no_scene_is_refused(data: bytes) -> None:
-    for content in (data, b"VSC4" + data):
+    for content in (data, analyse(pan(1, 0)).to_bytes()[:4] + data):
         with pytest.raises(ProtocolError):
             Scene.from_bytes(content)
 
@@ -316,6 +316,11 @@ MOVING = 64**2 * BLOCKS
 """Sum of squares where each block changes by a grey level."""
 
 
+def repeats_among(changes: list[int]) -> npt.NDArray[np.bool_]:
+    """Return which steps repeat a frame if the pictures go on after each of them."""
+    return duplicated(changes, np.ones(len(changes), bool), BLOCKS)
+
+
 @given(st.integers(2, 12), st.integers(0, 11), st.integers(0, 2**32))
 def test_one_repeat_in_each_period_is_found_and_named(period: int, offset: int, seed: int) -> None:
     offset, random = offset % period, np.random.default_rng(seed)
@@ -323,7 +328,7 @@ def test_one_repeat_in_each_period_is_found_and_named(period: int, offset: int, 
         MOVING * int(random.integers(1, 4)) if at % period != offset else int(random.integers(0, MOVING // 25 + 1))
         for at in range(10 * period)
     ]
-    flags = duplicated(changes, BLOCKS)
+    flags = repeats_among(changes)
     np.testing.assert_array_equal(flags, np.arange(len(changes)) % period == offset)
     special = {2: "every picture twice", 5: "24 in 30", 6: "25 in 30"}
     assert pattern_of(flags) == special.get(period, f"1 of every {period}")
@@ -339,7 +344,7 @@ def test_one_repeat_in_each_period_is_found_and_named(period: int, offset: int, 
     ],
 )
 def test_what_looks_like_a_repeat(changes: list[int]) -> None:
-    assert not duplicated(changes, BLOCKS).any()
+    assert not repeats_among(changes).any()
 
 
 @pytest.mark.parametrize("repeats", [3, 4])
@@ -348,7 +353,7 @@ def test_a_few_repeats_in_a_long_video_may_be_chance(repeats: int) -> None:
     changes = [MOVING] * 100
     changes[10 : 10 * (repeats + 1) : 10] = [MOVING // 8] * repeats
     changes[11 : 10 * (repeats + 1) + 1 : 10] = [2 * MOVING] * repeats
-    assert duplicated(changes, BLOCKS).sum() == (repeats if repeats >= 4 else 0)
+    assert repeats_among(changes).sum() == (repeats if repeats >= 4 else 0)
 
 
 @given(st.integers(0, 59), st.integers(0, MOVING // 12), st.integers(0, 2**32))
@@ -356,7 +361,54 @@ def test_a_single_repeat_amid_motion_is_found(place: int, change: int, seed: int
     changes = np.random.default_rng(seed).integers(MOVING, 2 * MOVING + 1, 60).tolist()
     changes[place] = change
     expected = [place] if 4 <= place < 56 else []
-    assert np.flatnonzero(duplicated(changes, BLOCKS)).tolist() == expected
+    assert np.flatnonzero(repeats_among(changes)).tolist() == expected
+
+
+def to_and_fro(what: str, hertz: float, size: float, reach: float, frames: int = 60, rate: float = 30.0) -> Luma:
+    """Return something that swings, flickers or turns over a photograph, with soft edges, [frames, 72, 104].
+
+    Args:
+        size: radius, px; of a metronome half the width of its arm.
+        reach: amplitude, px; of a lamp grey levels; of a wheel its radius.
+    """
+    at = 2 * np.pi * hertz / rate * np.arange(frames)[:, None, None] + 0.4
+    row, column = np.mgrid[:72, :104] - np.array([36, 52])[:, None, None]
+    scene = pan(1, 0, 72, 104)[0] / 3 + 40.0
+    if what == "lamp":
+        return np.rint(scene + 80 + reach * np.sin(at) * np.exp(-(row**2 + column**2) / (8 * size**2))).astype(np.uint8)
+    if what == "swing":
+        shown = size - np.hypot(column - reach * np.sin(at), row - reach / 4 * np.cos(2 * at))
+    elif what == "wheel":
+        spokes = size - np.abs(np.sin(5 * (np.arctan2(row, column) - at) / 2)) * np.hypot(row, column)
+        shown = np.minimum(spokes, reach - np.hypot(row, column))
+    else:
+        angle = reach / 60 * np.sin(at)
+        shown = size - np.abs((36 - row) * np.sin(angle) - column * np.cos(angle))
+    share = np.clip(shown + 0.5, 0, 1)
+    return np.rint(scene * (1 - share) + 225 * share).astype(np.uint8)
+
+
+@pytest.mark.parametrize("rate", [24.0, 30.0, 60.0])
+@pytest.mark.parametrize(
+    ("what", "size", "reach"),
+    [("swing", 9, 30), ("swing", 3, 36), ("lamp", 9, 40), ("wheel", 3, 30), ("metronome", 3, 30), ("metronome", 1, 12)],
+)
+def test_what_swings_flickers_or_turns_loses_no_frame(what: str, size: float, reach: float, rate: float) -> None:
+    """At its turns a step is as small as a repeat, but then the picture comes back."""
+    lost = {}
+    for hertz in (1.0, 2.0, 3.3, 5.0, 7.5, 10.0, 12.0):
+        kept = analyse(to_and_fro(what, hertz, size, reach, rate=rate)).frames_from(0, 60)
+        lost[hertz] = int(np.count_nonzero(kept >= 60))
+    assert set(lost.values()) == {0}, lost
+
+
+@pytest.mark.parametrize("what", ["swing", "lamp", "metronome"])
+def test_repeats_of_what_swings_are_found(what: str) -> None:
+    luma = to_and_fro(what, 1.0, 9 if what != "metronome" else 3, 30)
+    for source in (np.arange(60) * 4 // 5, np.arange(60) // 2, np.arange(60) * 2 // 5):
+        flags = np.concatenate([[False], np.diff(source) == 0])
+        kept = analyse(luma[source]).frames_from(0, int((~flags).sum()))
+        assert np.isin(kept, np.flatnonzero(~flags)).mean() > 0.8
 
 
 @given(st.lists(st.booleans(), max_size=40), st.integers(1, 5), st.integers(0, 3))
