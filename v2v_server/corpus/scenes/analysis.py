@@ -52,11 +52,11 @@ from v2v_server.corpus.scenes.stretches import (
     bars_of,
     change_of,
     duplicated,
+    halt_before,
     is_cut,
     is_flat,
     is_still,
     pieces_of,
-    steps_gone_on,
 )
 from v2v_server.flow import DIS_ULTRAFAST, GreyPicture, dis, one_thread
 
@@ -76,10 +76,9 @@ _JUMP_REACH = 8
 """Steps."""
 _LARGEST_RETURN = 0.5
 _KEPT_FRAMES = 9
-"""Those whose blocks are kept: a pattern has at most seven repeats in a row."""
+"""Those whose blocks are kept, for halts of up to seven steps."""
 _PIXEL_NOISE = 4
 """Grey levels."""
-_LEAST_REPEAT_RATIO = 5
 _BARS_EVERY = 8
 """Frames."""
 _COMB_LEVELS = 5
@@ -100,14 +99,13 @@ _Tiles = npt.NDArray[np.float64]
 
 
 class SceneAnalysis:
-    """Analyse a video frame by frame. Memory: four pictures, and some hundred bytes a frame."""
+    """Analyse a video frame by frame. Memory: three pictures, and some hundred bytes a frame."""
 
     def __init__(self) -> None:
         self._search = dis(DIS_ULTRAFAST, 1)
         self._frames = 0
         self._blocks: list[npt.NDArray[np.int64]] = []  # of the last frames, 1/64 grey level each
         self._last: GreyPicture | None = None
-        self._earlier: GreyPicture | None = None  # the one before the last
         self._reduced: tuple[int, GreyPicture] | None = (
             None  # a frame from which motion is to be measured, and its number
         )
@@ -115,7 +113,8 @@ class SceneAnalysis:
         self._variances: list[float] = []
         self._light: list[int] = []  # 1/64 grey level
         self._step_changes: list[int] = []  # of `change_of`
-        self._gone_on: list[bool] = []  # of `steps_gone_on`
+        self._pixel_changes: list[int] = []  # of `_pixel_change`
+        self._halts: list[bool] = []  # of `halt_before`
         self._still: list[bool] = []
         self._flat: list[bool] = []
         self._bars: list[tuple[int, Sides]] = []
@@ -144,12 +143,11 @@ class SceneAnalysis:
         self._still.append(is_still((self._blocks[-LAG_FRAMES:] or [blocks])[0], blocks))
         if number % _BARS_EVERY == 0 and not self._flat[-1]:
             self._bars.append((number, bars_of(picture)))
-        if self._blocks:
+        if self._last is not None:
             self._step_changes.append(change_of(self._blocks[-1], blocks))
-            count = steps_gone_on([*self._blocks, blocks], self._step_changes)
-            if count and not _is_alike(self._earlier, self._last, picture):
-                count = 0  # something smaller than a block moves within it
-            self._gone_on[number - 1 - count :] = [True] * count + [False]
+            self._pixel_changes.append(_pixel_change(self._last, picture))
+            count = halt_before([*self._blocks, blocks], self._step_changes, self._pixel_changes)
+            self._halts[number - 1 - count :] = [True] * count + [False]
             if number % LAG_FRAMES == 0:
                 self._combed.append((number, _is_combed(picture, np.abs(blocks - self._blocks[-1]))))
             self._steps.append(_difference(self._blocks[-1], blocks))
@@ -164,7 +162,7 @@ class SceneAnalysis:
             dark, clipped = map(np.count_nonzero, (picture < DARK_BELOW_LEVEL, picture >= CLIPPED_FROM_LEVEL))
             self._shares.append((number, dark / picture.size, clipped / picture.size))
             self._measure_motion(number, picture)
-        self._earlier, self._last = self._last, picture
+        self._last = picture
 
     def _measure_motion(self, number: int, picture: GreyPicture) -> None:
         reduced = _reduced(picture)
@@ -204,7 +202,7 @@ class SceneAnalysis:
             row[FLICKER] = rippled.mean() if len(rippled) else 0.0
             row[NOISE] = next((noise for frame, noise in self._noises if low <= frame < high), np.nan)
         quiet = np.repeat(values[:, CHANGE].mean(axis=1) < _QUIET_CHANGE, SEGMENT_FRAMES)[: self._frames]
-        repeats = duplicated(self._step_changes, np.array(self._gone_on, bool), self._blocks[-1].size, boundaries)
+        repeats = duplicated(self._step_changes, np.array(self._halts, bool), self._blocks[-1].size, boundaries)
         assert self._last is not None
         pieces = pieces_of(
             np.array(self._light), np.array(self._variances), np.array(self._still), np.array(self._flat), quiet,
@@ -265,16 +263,11 @@ def block_sums(picture: GreyPicture) -> npt.NDArray[np.int64]:
     return blocks
 
 
-def _is_alike(before: GreyPicture | None, picture: GreyPicture | None, after: GreyPicture) -> bool:
-    """Return whether a picture differs from the one before it by at most 1/5 of what it differs by from the next.
-
-    Squared, without what a coder may change of a pixel. A picture that is not there counts as alike.
-    """
-    if before is None or picture is None:
-        return True
-    changes = (cv2.subtract(cv2.absdiff(picture, other), _PIXEL_NOISE) for other in (before, after))
-    small, large = (cv2.norm(each, cv2.NORM_L2SQR) for each in changes)
-    return _LEAST_REPEAT_RATIO * small <= large
+def _pixel_change(before: GreyPicture, after: GreyPicture) -> int:
+    """Return the sum of the squared changes of all pixels, without what a coder may change of each, grey level^2."""
+    change = cv2.absdiff(before, after)
+    cv2.subtract(change, _PIXEL_NOISE, dst=change)
+    return int(cv2.norm(change, cv2.NORM_L2SQR))
 
 
 def _covariance(first: npt.NDArray[np.int64], second: npt.NDArray[np.int64]) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -41,7 +42,7 @@ from v2v_server.corpus.scenes.scene import (
     clip_pieces,
     firsts_of,
 )  # fmt: skip
-from v2v_server.corpus.scenes.stretches import duplicated, pattern_of, runs_of
+from v2v_server.corpus.scenes.stretches import change_of, duplicated, halt_before, pattern_of, runs_of
 from v2v_server.corpus_words import notes_of
 from v2v_server.system.isolate import run_twice
 from v2v_server.video.rows import Rows
@@ -317,8 +318,20 @@ MOVING = 64**2 * BLOCKS
 
 
 def repeats_among(changes: list[int]) -> npt.NDArray[np.bool_]:
-    """Return which steps repeat a frame if the pictures go on after each of them."""
-    return duplicated(changes, np.ones(len(changes), bool), BLOCKS)
+    """Return which steps repeat a frame, each of which changes another block."""
+    blocks = np.zeros((len(changes) + 1, BLOCKS), np.int64)
+    for at, change in enumerate(changes):
+        blocks[at + 1 :, at % BLOCKS] += math.isqrt(change)
+    return duplicated(changes, halts_of(blocks, changes), BLOCKS)
+
+
+def halts_of(blocks: npt.NDArray[np.int64], changes: list[int]) -> npt.NDArray[np.bool_]:
+    """Return which steps are counted as halts, by a loop over all of them."""
+    halts = np.zeros(len(changes), bool)
+    for end in range(1, len(changes) + 1):
+        count = halt_before([*blocks[max(0, end - 9) : end + 1]], changes[:end], changes[:end])
+        halts[end - 1 - count : end - 1] = True
+    return halts
 
 
 @given(st.integers(2, 12), st.integers(0, 11), st.integers(0, 2**32))
@@ -364,6 +377,50 @@ def test_a_single_repeat_amid_motion_is_found(place: int, change: int, seed: int
     assert np.flatnonzero(repeats_among(changes)).tolist() == expected
 
 
+@given(st.data(), st.lists(st.sampled_from([0, MOVING // 20, MOVING, 3 * MOVING]), min_size=1, max_size=60))
+def test_repeats_are_looked_for_in_shots_of_any_length(data: st.DataObject, changes: list[int]) -> None:
+    boundaries = sorted(data.draw(st.sets(st.integers(1, len(changes)), max_size=9)))
+    halts = np.array(data.draw(st.lists(st.booleans(), min_size=len(changes), max_size=len(changes))), bool)
+    flags = duplicated(changes, halts, BLOCKS, boundaries)
+    assert flags.shape == halts.shape
+    assert not flags[[boundary - 1 for boundary in boundaries]].any()  # a cut repeats nothing
+
+
+def moved_along(places: list[int]) -> tuple[list[npt.NDArray[np.int64]], list[int]]:
+    """Return the blocks of pictures all of which change alike, and their changes."""
+    blocks = [np.full((10, 10), 256 * place, np.int64) for place in places]
+    return blocks, list(map(change_of, blocks[:-1], blocks[1:]))
+
+
+@pytest.mark.parametrize(
+    ("places", "halts"),
+    [
+        pytest.param([0, 10, 10, 20], 1, id="a repeat"),
+        pytest.param([0, 10, 11, 21], 1, id="a repeat that a coder blends"),
+        pytest.param([0, 10, 10, 10, 20], 2, id="two of three"),
+        pytest.param([0, *[10] * 8, 20], 7, id="seven repeats"),
+        pytest.param([0, 10, 14, 14, 24], 1, id="the next step makes up for it"),
+        pytest.param([0, 10, 10, 0], 0, id="a turn"),
+        pytest.param([0, 10, 12, 2], 0, id="a turn between two frames"),
+        pytest.param([0, 10, 10, 3], 0, id="a turn of uneven speed"),
+        pytest.param([0, 10, 15, 25], 0, id="slower, not small"),
+        pytest.param([0, 2, 3, 13], 0, id="motion begins"),
+        pytest.param([10, 10, 20], 0, id="nothing is known of the step before"),
+    ],
+)
+def test_where_a_picture_halts(places: list[int], halts: int) -> None:
+    blocks, changes = moved_along(places)
+    assert halt_before(blocks, changes, changes) == halts
+    pixels = [max(changes)] * len(changes)
+    assert halt_before(blocks, changes, pixels) == 0, "something smaller than a block moves"
+
+
+@given(st.integers(1, 60), st.integers(-200, 200), st.integers(1, 9))
+def test_no_turn_at_constant_acceleration_is_a_halt(pace: int, phase: int, scale: int) -> None:
+    blocks, changes = moved_along([scale * (pace * at + phase) ** 2 for at in range(-5, 6)])
+    assert not halts_of(np.array(blocks), changes).any()
+
+
 def to_and_fro(what: str, hertz: float, size: float, reach: float, frames: int = 60, rate: float = 30.0) -> Luma:
     """Return something that swings, flickers or turns over a photograph, with soft edges, [frames, 72, 104].
 
@@ -391,7 +448,15 @@ def to_and_fro(what: str, hertz: float, size: float, reach: float, frames: int =
 @pytest.mark.parametrize("rate", [24.0, 30.0, 60.0])
 @pytest.mark.parametrize(
     ("what", "size", "reach"),
-    [("swing", 9, 30), ("swing", 3, 36), ("lamp", 9, 40), ("wheel", 3, 30), ("metronome", 3, 30), ("metronome", 1, 12)],
+    [
+        ("swing", 9, 30),
+        ("swing", 3, 36),
+        ("lamp", 9, 40),
+        ("lamp", 20, 6),
+        ("wheel", 3, 30),
+        ("metronome", 3, 30),
+        ("metronome", 1, 12),
+    ],
 )
 def test_what_swings_flickers_or_turns_loses_no_frame(what: str, size: float, reach: float, rate: float) -> None:
     """At its turns a step is as small as a repeat, but then the picture comes back."""
