@@ -266,7 +266,7 @@ def block_sums(picture: GreyPicture) -> npt.NDArray[np.int64]:
 def _pixel_change(before: GreyPicture, after: GreyPicture) -> int:
     """Return the sum of the squared changes of all pixels, without what a coder may change of each, grey level^2."""
     change = cv2.absdiff(before, after)
-    cv2.subtract(change, _PIXEL_NOISE, dst=change)
+    cv2.subtract(change, _PIXEL_NOISE, dst=change)  # type: ignore[call-overload]
     return int(cv2.norm(change, cv2.NORM_L2SQR))
 
 
