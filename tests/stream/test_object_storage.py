@@ -9,7 +9,9 @@ import shutil
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from importlib.util import find_spec
+from itertools import islice
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -22,6 +24,7 @@ from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of
 from tests.waiting import until
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
+from v2v_server.corpus.catalogue import open_catalogue
 
 # Looked for, not imported: the fast tests are collected without them.
 missing = [name for name in ("moto", "s3fs") if find_spec(name) is None]
@@ -165,21 +168,32 @@ def test_a_store_that_is_away_condemns_no_video(clips: Path, bucket: Bucket, tmp
 def test_a_tar_of_600_members_is_one_question_to_list_one_to_index_and_one_a_member(
     clips: Path, bucket: Bucket, tmp_path: Path
 ) -> None:
-    """Asked by a server and its workers; the samples are those of the files unpacked."""
+    """Half of them are videos. The samples are those of the files unpacked."""
     below, videos = tmp_path / "plain" / "0", [path for path in sorted(clips.rglob("*")) if path.is_file()]
     below.mkdir(parents=True)
     for number in range(300):
         shutil.copy(videos[number % len(videos)], below / f"{number:03}{videos[number % len(videos)].suffix}")
         (below / f"{number:03}.txt").write_text("a caption")
-    with LocalServer(below.parent, workers=1, flags=SMALL_FLAGS) as local:
-        reference = digests(local.address, 0)
     pack(below, tmp_path / "tar" / "0.tar")
     bucket.fill(tmp_path / "tar", "tar")
-    with LocalServer("s3://corpus/tar", workers=2, flags=SMALL_FLAGS) as server:
-        kinds = Counter(re.sub(r".*(GET|HEAD) (/corpus\S*?)(\?\S*)? HTTP.*", r"\1 \2", text) for text in bucket.asked)
-        assert digests(server.address, 0) == reference
-        assert kinds == {"GET /corpus": 1, "GET /corpus/tar/0.tar": 1 + 300}
-        bucket.asked.clear()
-        forget_copies(tmp_path)
-        assert digests(server.address, 0) == reference
-        assert len(bucket.asked) == 300, "workers need no table, and ask nothing else"
+    cache = tmp_path / "cache"
+    with (
+        closing(open_catalogue(below.parent, cache_dir=cache)) as plain,
+        closing(open_catalogue("s3://corpus/tar", cache_dir=cache, processes=2)) as packed,
+    ):
+        assert (packed.digest, len(packed.videos)) == (plain.digest, 300)
+    assert questions(bucket) == {"GET /corpus": 1, "GET /corpus/tar/0.tar": 1 + 300}
+    forget_copies(tmp_path)
+    bucket.asked.clear()
+    found = {}
+    for source in (below.parent, "s3://corpus/tar"):
+        with LocalServer(source, workers=2, flags=SMALL_FLAGS) as server:
+            found[source] = list(map(digest, islice(stream_of(server), 6)))
+    assert len(set(map(tuple, found.values()))) == 1
+    asked = questions(bucket)
+    assert asked.keys() == {"GET /corpus", "GET /corpus/tar/0.tar"}, "workers need no table, and ask nothing else"
+    assert asked["GET /corpus"] == 1
+
+
+def questions(bucket: Bucket) -> Counter[str]:
+    return Counter(re.sub(r".*(GET|HEAD) (/corpus[^? ]*).* HTTP.*", r"\1 \2", text) for text in bucket.asked)

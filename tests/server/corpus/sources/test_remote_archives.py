@@ -1,5 +1,5 @@
-"""Archives in object storage: the same ids, catalogue and samples as those of a folder, few questions, and no mixture of
-two states of one archive.
+"""Archives in object storage: the same ids, catalogue and samples as those of a folder, few questions, and no mixture
+of two states of one archive.
 """
 
 from __future__ import annotations
@@ -199,7 +199,7 @@ def test_a_server_without_parts_is_refused_in_words(forms: Mapping[str, Path], w
     with opened(address, tmp_path) as catalogue:
         assert list(catalogue.videos.ids) == ["z.mp4"]
         assert {each.reason for each in catalogue.refusals} == {
-            "its server sends whole files only: copy the archives to a disk of this host"
+            "its server sends whole files only: copy the archives to a disk"
         }
 
 
