@@ -121,7 +121,8 @@ def read_table(source: VideoSource, job: _Job) -> tuple[bytes, str]:
     """Return what the index keeps of an archive, packed: why it is refused, and its table; or why it was not read."""
     archive, path = job
     try:
-        with open(path, "rb", opener=_opened) as file:
+        with open(os.open(path, os.O_NONBLOCK), "rb") as file:  # the writer of a pipe may have ended already
+            os.set_blocking(file.fileno(), True)
             table = archives.read_table(file, archive, source.kind.id_of, not source.is_local)
         return msgpack.packb(("", table.to_bytes())), ""
     except ValueError as error:
@@ -130,10 +131,3 @@ def read_table(source: VideoSource, job: _Job) -> tuple[bytes, str]:
         return b"", _line(error)
     except Exception as error:  # noqa: BLE001 - one strange archive must not end the reading of all others
         return msgpack.packb((f"reading it failed ({type(error).__name__}: {error})", b"")), ""
-
-
-def _opened(path: str, flags: int) -> int:
-    """Open a file, or a pipe whose writer may have ended already."""
-    descriptor = os.open(path, flags | os.O_NONBLOCK)
-    os.set_blocking(descriptor, True)
-    return descriptor

@@ -209,10 +209,6 @@ def run_lent(
     """
     failed, lent = list[tuple[T, V2VError | OSError]](), dict[int, tuple[T, ExitStack]]()
 
-    def release() -> None:
-        for _, stack in lent.values():
-            stack.close()
-
     def jobs() -> Iterator[J]:
         for item in items:
             with ExitStack() as stack:
@@ -224,17 +220,20 @@ def run_lent(
                 lent[id(job)] = item, stack.pop_all()
                 yield job
 
-    with ExitStack() as at_end, closing(run_isolated(function, jobs(), processes, **limits)) as results:
-        at_end.callback(release)  # once the processes have ended
-        for job, result in results:
-            item, stack = lent.pop(id(job))
-            found: _R | Died | V2VError | OSError = result
-            try:
-                stack.close()
-            except (V2VError, OSError) as error:
-                found = error
-            yield item, found
-        yield from failed
+    try:
+        with closing(run_isolated(function, jobs(), processes, **limits)) as results:
+            for job, result in results:
+                item, stack = lent.pop(id(job))
+                found: _R | Died | V2VError | OSError = result
+                try:
+                    stack.close()
+                except (V2VError, OSError) as error:
+                    found = error
+                yield item, found
+    finally:  # once the processes have ended
+        for _, stack in lent.values():
+            stack.close()
+    yield from failed
 
 
 def _wait(lanes: list[_Lane[J, _R]]) -> list[Any]:

@@ -48,8 +48,7 @@ _BLOCK_BYTES = 1 << 20
 _PLACE_BITS = 48
 """Of the first byte of a member of a remote archive."""
 LEAVES = "has a name that leads out of the archive, or an empty part: rename it"
-SAME_IDS = "would give the same ids as {} beside it: move one of them away"
-CHANGES = "changes while it is read; start again"
+CHANGES_WHILE_READ = "changes while it is read; start again"
 CUT = "is cut short, or damaged: fetch it again"
 
 
@@ -167,6 +166,14 @@ def find_archive(
         if not is_folder(stem):
             return next((stem + ending for ending in endings if is_file(stem + ending)), "")
     return ""
+
+
+def same_ids(archive: str, endings: Sequence[str], is_there: Callable[[str], bool]) -> str:
+    """Return why an archive is refused: beside it lies a folder or archive that gives the same ids. "" if none does."""
+    stem, dot, ending = archive.rpartition(".")
+    others = (stem + other for other in ("", *endings) if dot + ending in endings and other != dot + ending)
+    found = next(filter(is_there, others), "").rpartition("/")[2]
+    return found and f"would give the same ids as {found} beside it: move one of them away"
 
 
 def read_table(file: IO[bytes], path: str, is_video: Callable[[str], object], is_remote: bool = False) -> ArchiveTable:

@@ -44,7 +44,6 @@ from v2v_protocol.programs import install_line, printable
 from v2v_server.corpus.sources.archives import (
     MOST_DIRECTORY_BYTES,
     MOST_ZIP_HEAD_BYTES,
-    SAME_IDS,
     ZIP_END_BYTES,
     ZIP_HEAD_BYTES,
     MemberPath,
@@ -52,12 +51,13 @@ from v2v_server.corpus.sources.archives import (
     directory_bytes,
     find_archive,
     name_in,
+    same_ids,
     split_place,
     zip_head_rest,
 )
 from v2v_server.corpus.sources.copy_folder import CopyFolder
 from v2v_server.corpus.sources.listing import ListEntry, answers, count_left_out
-from v2v_server.corpus.sources.object_parts import BLOCK_BYTES, Read, copy_bytes, open_part
+from v2v_server.corpus.sources.object_parts import PART_BYTES, ReadBytes, copy_bytes, open_part
 from v2v_server.corpus.sources.sidecars import is_sidecar, sidecar_fingerprint, state_of_parts, state_text
 from v2v_server.corpus.sources.source import (
     GONE,
@@ -208,7 +208,7 @@ class Bucket:
         id: str,
         part: tuple[int, int],
         is_same: Callable[[FileState], bool],
-        use: Callable[[Read], T],
+        use: Callable[[ReadBytes], T],
         tries: int = TRIES,
         member: str = "",
     ) -> T:
@@ -343,8 +343,8 @@ class Copies(VideoSource):
                 refused[printable(name)] = UNPRINTABLE
             elif "" in parts or id == "/":
                 refused[name] = "has an empty part between two slashes, or is a picture outside of a folder"
-            elif other := self._beside(name):
-                refused[name] = SAME_IDS.format(other)
+            elif why := same_ids(name, self.kind.archive_endings, self._is_there):
+                refused[name] = why
             else:
                 yield id
 
@@ -355,15 +355,8 @@ class Copies(VideoSource):
     def _is_folder(self, path: str) -> bool:
         return next(self._below(f"{path}/"), None) is not None
 
-    def _beside(self, name: str) -> str:
-        """Return the name of a listed folder or archive whose videos would have the ids of an archive's; or ""."""
-        stem, dot, ending = name.rpartition(".")
-        if dot + ending not in self.kind.archive_endings:
-            return ""
-        found = [stem] * self._is_folder(stem) + [stem + end for end in self.kind.archive_endings]
-        return next(
-            (each.rpartition("/")[2] for each in found if each != name and (each == stem or each in self._objects)), ""
-        )
+    def _is_there(self, path: str) -> bool:
+        return path in self._objects or self._is_folder(path)
 
     def states(self, ids: Sequence[str]) -> array[int]:
         """Return the states of many objects, from the listing."""
@@ -503,7 +496,7 @@ class Copies(VideoSource):
         archive, start = split_place(id, told[1], self.kind.archive_endings)
         is_zip, size = archive.endswith(".zip"), told[0]
 
-        def use(read: Read) -> None:
+        def use(read: ReadBytes) -> None:
             with slot.open("wb") as file:
                 if is_zip:
                     copy_bytes(read, head := BytesIO(), ZIP_HEAD_BYTES)
@@ -540,9 +533,9 @@ class Copies(VideoSource):
                 fed.result()
 
     def _feed(self, archive: str, state: FileState, pipe: int) -> None:
-        def use(read: Read) -> None:
+        def use(read: ReadBytes) -> None:
             with contextlib.suppress(BrokenPipeError):
-                while block := read(BLOCK_BYTES):
+                while block := read(PART_BYTES):
                     to.write(block)
 
         with open(pipe, "wb", buffering=0) as to:
@@ -558,7 +551,7 @@ class Copies(VideoSource):
         def last(count: int) -> bytes:
             count = min(count, state[0])
 
-            def use(read: Read) -> bytes:
+            def use(read: ReadBytes) -> bytes:
                 copy_bytes(read, end := BytesIO(), count)
                 return end.getvalue()
 

@@ -18,14 +18,14 @@ from v2v_protocol.errors import CorpusError, VideoChanged, VideoError
 from v2v_protocol.programs import printable
 from v2v_protocol.write_aside import OUTPUT_MARKER
 from v2v_server.corpus.sources.archives import (
-    CHANGES,
-    SAME_IDS,
+    CHANGES_WHILE_READ,
     ArchiveTable,
     MemberPath,
     archive_mark,
     find_archive,
     name_in,
     read_table,
+    same_ids,
 )
 from v2v_server.corpus.sources.listing import LIST_SUFFIXES, ListEntry, answers, count_left_out, read_list
 from v2v_server.corpus.sources.sidecars import check_local, is_sidecar, local_state, sidecar_id, state_of_parts
@@ -179,7 +179,7 @@ class Folder(VideoSource):
         """Lend an archive's own path, see :meth:`HasArchives.lend_archive`."""
         yield f"{self.name}/{archive}"
         if self.state(archive) != state:
-            raise VideoChanged(archive, None, CHANGES)
+            raise VideoChanged(archive, None, CHANGES_WHILE_READ)
 
     def open_local(self, id: str, fingerprint: str) -> AbstractContextManager[Path]:
         """Lend the file; only a sidecar of one file is checked.
@@ -395,7 +395,7 @@ def video_files(
         left_out: counts, by suffix, files that may be videos of other endings; and, by path, folders of outputs.
         kind: what a video is; the id of a folder of pictures ends with a slash.
     """
-    id_of, pseudo, paths_of = kind.id_of, pseudo_devices(), Counter[tuple[int, int]]()
+    pseudo, paths_of = pseudo_devices(), Counter[tuple[int, int]]()
 
     def below(folder: Path, prefix: str, above: frozenset[tuple[int, int]], links: int) -> Iterator[list[str]]:
         """Yield the videos below a folder, some at a time.
@@ -447,17 +447,14 @@ def video_files(
                 more = links + entry.is_symlink()
                 yield from below(folder / entry.name, f"{relative}/", above | {identity}, more)
             elif id := kind.entry_of(relative):
-                stem = "" if id_of(relative) else entry.name.rpartition(".")[0]
-                same = [stem + ending for ending in ("", *kind.archive_endings) if stem and stem + ending in names]
                 if printable(relative) != relative:
                     refused[printable(relative)] = UNPRINTABLE
                 elif not is_file:
                     refused[relative] = "is not a regular file, or is a broken link"
                 elif is_pseudo:
                     refused[relative] = PSEUDO
-                elif stem and same != [entry.name]:
-                    other = next(name for name in same if name != entry.name)
-                    refused[relative] = SAME_IDS.format(other)
+                elif why := same_ids(entry.name, kind.archive_endings, names.__contains__):
+                    refused[relative] = why
                 else:
                     found.append(id)
             elif is_file:

@@ -14,13 +14,13 @@ from typing import IO, Any
 
 from v2v_protocol.errors import VideoUnreadable
 
-BLOCK_BYTES = 1 << 20
-Read = Callable[[int], bytes]
+PART_BYTES = 1 << 20
+ReadBytes = Callable[[int], bytes]
 """Returns the next bytes, at most as many as asked for; none at the end."""
 
 
 @contextmanager
-def open_part(store: Any, path: str, start: int, end: int) -> Iterator[tuple[Read, Mapping[str, Any] | None]]:
+def open_part(store: Any, path: str, start: int, end: int) -> Iterator[tuple[ReadBytes, Mapping[str, Any] | None]]:
     """Lend what reads bytes ``start .. end - 1`` of an object, and what the answer says of the object.
 
     It may read on, where a store knows no end. What the answer says is None if it says nothing, else ``size`` in bytes
@@ -54,28 +54,26 @@ def open_part(store: Any, path: str, start: int, end: int) -> Iterator[tuple[Rea
         length, part = file.r.headers.get("Content-Length"), file.r.headers.get("Content-Range", "")
         read, close = file.read, file.close
     else:
-        with store.open(path, "rb", block_size=BLOCK_BYTES, cache_type="none") as file:
+        with store.open(path, "rb", block_size=PART_BYTES, cache_type="none") as file:
             file.seek(start)
             yield file.read, None
         return
     try:
         if asked and not part:
-            raise VideoUnreadable(
-                path, None, "its server sends whole files only: copy the archives to a disk of this host"
-            )
+            raise VideoUnreadable(path, None, "its server sends whole files only: copy the archives to a disk")
         yield read, told | {"size": part.rpartition("/")[2] if part else length}
     finally:
         close()
 
 
-def copy_bytes(read: Read, file: IO[bytes], size: int) -> None:
+def copy_bytes(read: ReadBytes, file: IO[bytes], size: int) -> None:
     """Write the next bytes to a file.
 
     Raises:
         EOFError: there are fewer.
     """
     while size:
-        if not (block := read(min(size, BLOCK_BYTES))):
+        if not (block := read(min(size, PART_BYTES))):
             raise EOFError("its answer ends early")
         file.write(block)
         size -= len(block)
