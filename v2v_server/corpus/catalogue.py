@@ -10,8 +10,8 @@ import hashlib
 import os
 import sqlite3
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby
@@ -62,6 +62,7 @@ from v2v_server.corpus.videos import (
     IndexRow,
     Sidecars,
     Thresholds,
+    VideoEntry,
     Videos,
     VideoTable,
     joined,
@@ -336,6 +337,18 @@ class Catalogue:
         self.folder  # noqa: B018 - raises where there is none
         with self.source.open_local(id, "") as path:
             return Path(os.fspath(path))
+
+    @contextmanager
+    def lend(self, video: VideoEntry) -> Iterator[Path]:
+        """Lend the file of a video, or its copy on this host, until the end of the context.
+
+        Raises:
+            VideoUnreadable, VideoChanged: see :meth:`VideoSource.open_local`.
+        """
+        state = self.state(video.id)
+        self.source.expected = video.id, unmarked(self.source, video.id, state) if state else ()
+        with self.source.open_local(video.id, video.fingerprint) as path:
+            yield Path(os.fspath(path))
 
     def check(self, id: str, fingerprint: str, sidecar: str = "") -> None:
         """Check that the video is as catalogued, or its sidecar of that ending, see :meth:`VideoSource.verify`.

@@ -17,7 +17,16 @@ from typing import cast
 from v2v_protocol.errors import CorpusError, VideoChanged, VideoError
 from v2v_protocol.programs import printable
 from v2v_protocol.write_aside import OUTPUT_MARKER
-from v2v_server.corpus.sources.archives import ArchiveTable, MemberPath, archive_mark, find_archive, read_table
+from v2v_server.corpus.sources.archives import (
+    CHANGES_WHILE_READ,
+    ArchiveTable,
+    MemberPath,
+    archive_mark,
+    find_archive,
+    name_in,
+    read_table,
+    same_ids,
+)
 from v2v_server.corpus.sources.listing import LIST_SUFFIXES, ListEntry, answers, count_left_out, read_list
 from v2v_server.corpus.sources.sidecars import check_local, is_sidecar, local_state, sidecar_id, state_of_parts
 from v2v_server.corpus.sources.source import (
@@ -132,7 +141,7 @@ class Folder(VideoSource):
         if os.path.lexists(path) or not (archive := self.archive_of(id)):
             return Path(path)
         try:
-            size, start = (self._place(id) or self._table(archive).place(_name_in(archive, id)))[:2]
+            size, start = (self._place(id) or self._table(archive).place(name_in(archive, id)))[:2]
         except OSError as error:
             raise unreadable(id, error) from error
         return cast(Path, FileRange(f"{self.name}/{archive}", start, start + size))
@@ -148,7 +157,7 @@ class Folder(VideoSource):
             return path
         try:
             mark, table = self._mark(archive), self._table(archive)
-            return cast(Path, MemberPath(f"{self.name}/{archive}", mark, _name_in(archive, id), table))  # type: ignore[abstract]
+            return cast(Path, MemberPath(f"{self.name}/{archive}", mark, name_in(archive, id), table))  # type: ignore[abstract]
         except OSError as error:
             raise unreadable(id, error) from error
 
@@ -165,10 +174,12 @@ class Folder(VideoSource):
         except ValueError as error:
             raise OSError(errno.EIO, str(error)) from error
 
-    def read_table(self, archive: str) -> bytes:
-        """Read the table of an archive, see :class:`HasArchives`."""
-        with open_bytes(f"{self.name}/{archive}") as file:
-            return read_table(file, archive, self.kind.id_of).to_bytes()
+    @contextmanager
+    def lend_archive(self, archive: str, state: FileState) -> Iterator[str]:
+        """Lend an archive's own path, see :meth:`HasArchives.lend_archive`."""
+        yield f"{self.name}/{archive}"
+        if self.state(archive) != state:
+            raise VideoChanged(archive, None, CHANGES_WHILE_READ)
 
     def open_local(self, id: str, fingerprint: str) -> AbstractContextManager[Path]:
         """Lend the file; only a sidecar of one file is checked.
@@ -312,12 +323,8 @@ class Folder(VideoSource):
 
 @lru_cache(maxsize=64)
 def _read_once(source: Folder, archive: str, state: FileState) -> ArchiveTable:
-    return ArchiveTable.from_bytes(source.read_table(archive), state[0])
-
-
-def _name_in(archive: str, id: str) -> str:
-    """Return the name in its archive of a member of that id."""
-    return id[len(archive.rpartition(".")[0]) + 1 :].rstrip("/")
+    with open_bytes(f"{source.name}/{archive}") as file:
+        return ArchiveTable.from_bytes(read_table(file, archive, source.kind.id_of).to_bytes(), state[0])
 
 
 def _numbers(status: os.stat_result) -> FileState:
@@ -388,7 +395,7 @@ def video_files(
         left_out: counts, by suffix, files that may be videos of other endings; and, by path, folders of outputs.
         kind: what a video is; the id of a folder of pictures ends with a slash.
     """
-    id_of, pseudo, paths_of = kind.id_of, pseudo_devices(), Counter[tuple[int, int]]()
+    pseudo, paths_of = pseudo_devices(), Counter[tuple[int, int]]()
 
     def below(folder: Path, prefix: str, above: frozenset[tuple[int, int]], links: int) -> Iterator[list[str]]:
         """Yield the videos below a folder, some at a time.
@@ -439,18 +446,15 @@ def video_files(
                 found = []
                 more = links + entry.is_symlink()
                 yield from below(folder / entry.name, f"{relative}/", above | {identity}, more)
-            elif id := id_of(relative) or (relative if relative.endswith(kind.archive_endings) else ""):
-                stem = "" if id_of(relative) else entry.name.rpartition(".")[0]
-                same = [stem + ending for ending in ("", *kind.archive_endings) if stem and stem + ending in names]
+            elif id := kind.entry_of(relative):
                 if printable(relative) != relative:
                     refused[printable(relative)] = UNPRINTABLE
                 elif not is_file:
                     refused[relative] = "is not a regular file, or is a broken link"
                 elif is_pseudo:
                     refused[relative] = PSEUDO
-                elif stem and same != [entry.name]:
-                    other = next(name for name in same if name != entry.name)
-                    refused[relative] = f"would give the same ids as {other} beside it: move one of them away"
+                elif why := same_ids(entry.name, kind.archive_endings, names.__contains__):
+                    refused[relative] = why
                 else:
                     found.append(id)
             elif is_file:
