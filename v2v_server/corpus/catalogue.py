@@ -333,7 +333,7 @@ class Catalogue:
         Raises:
             CorpusError: there is no such id in this catalogue, or no such folder on this host.
         """
-        self.source.expected = id, self.state(id) or ()
+        self._expect(id)
         self.folder  # noqa: B018 - raises where there is none
         with self.source.open_local(id, "") as path:
             return Path(os.fspath(path))
@@ -345,8 +345,7 @@ class Catalogue:
         Raises:
             VideoUnreadable, VideoChanged: see :meth:`VideoSource.open_local`.
         """
-        state = self.state(video.id)
-        self.source.expected = video.id, unmarked(self.source, video.id, state) if state else ()
+        self._expect(video.id)
         with self.source.open_local(video.id, video.fingerprint) as path:
             yield Path(os.fspath(path))
 
@@ -367,10 +366,15 @@ class Catalogue:
         Raises:
             VideoChanged, VideoUnreadable: they are not the catalogued ones, or cannot be told.
         """
-        known = self.state(id)
-        self.source.expected = id, known or ()
+        known = self._expect(id)
         if self.source.is_local and self.source.state(id) != known:
             raise VideoChanged(id, None, CHANGED)
+
+    def _expect(self, id: str) -> FileState | None:
+        """Tell the source in which state a video was catalogued, and return the state."""
+        state = self.state(id)
+        self.source.expected = id, unmarked(self.source, id, state) if state else ()
+        return state
 
     def state(self, id: str) -> FileState | None:
         """Return the state in which a video was catalogued; None if the index cannot tell.

@@ -17,9 +17,9 @@ from v2v_protocol.errors import VideoError
 from v2v_server.corpus.index import FigureKind, Figures, Store
 from v2v_server.corpus.probe import LARGEST_PROBE_BYTES, LONGEST_SECONDS
 from v2v_server.corpus.sources import archives
-from v2v_server.corpus.sources.archives import ArchiveTable, HasArchives, archive_mark, member_id, with_archive
+from v2v_server.corpus.sources.archives import ArchiveTable, HasArchives, member_id
 from v2v_server.corpus.sources.listing import Notice
-from v2v_server.corpus.sources.source import FileState, VideoSource, mark_of
+from v2v_server.corpus.sources.source import FileState, Member, VideoSource, archive_mark
 from v2v_server.system.isolate import Died, run_lent
 
 _Archive = tuple[str, FileState]
@@ -51,12 +51,11 @@ def list_members(
             refused[archive] = table
             continue
         source.tables[archive] = table
-        bits = 0 if source.is_local else with_archive(archive, kind.archive_endings)
         mark, takes_all = archive_mark(archive, state), wanted is None or archive in wanted
         for name, (size, start) in zip(table.names, table.places.tolist(), strict=True):
             id = member_id(archive, name)
             if kind.id_of(id) and (takes_all or (wanted and id in wanted)):
-                source.members[id] = size, start | bits, mark ^ mark_of(source, id)
+                source.members[id] = Member(archive, size, start, mark).state
                 found.append(id)
         refused.update((member_id(archive, name), reason) for name, reason in table.refused)
         for note in table.notes:

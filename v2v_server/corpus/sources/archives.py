@@ -1,15 +1,14 @@
 """Archives whose members are videos where they lie: tar files, and zip files without compression.
 
 The id of a member is the archive's path without its ending, a slash, and the member's name: that of the file in the
-folder that the archive unpacks to. The state of a member is its size, its first byte in the archive, and a number that
-changes with the archive. So a job or lease, which has the state of its video, says where to read it, and only the
-process that makes the table of an archive parses one.
+folder that the archive unpacks to. The state of a member says where it lies (:class:`Member` of ``source``). So a job
+or lease, which has the state of its video, says where to read it, and only the process that makes the table of an
+archive parses one.
 """
 
 from __future__ import annotations
 
 import errno
-import hashlib
 import io
 import os
 import re
@@ -45,8 +44,6 @@ MOST_ZIP_HEAD_BYTES = ZIP_HEAD_BYTES + 2 * 65535
 ZIP_END_BYTES, MOST_DIRECTORY_BYTES = 1 << 17, 256 << 20
 """Of a remote zip file: what is fetched of its end at first, and the limit of what is fetched for its directory."""
 _BLOCK_BYTES = 1 << 20
-_PLACE_BITS = 48
-"""Of the first byte of a member of a remote archive."""
 LEAVES = "has a name that leads out of the archive, or an empty part: rename it"
 CHANGES_WHILE_READ = "changes while it is read; start again"
 CUT = "is cut short, or damaged: fetch it again"
@@ -129,12 +126,6 @@ class ArchiveTable:
         return cls(names, found, tuple(zip(refused, reasons, strict=True)), notes)
 
 
-def archive_mark(path: str, state: Sequence[int]) -> int:
-    """Return 62 bits that change with an archive: by its ending and its state."""
-    text = repr((path.rpartition(".")[2], *state))
-    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8]) >> 2
-
-
 def member_id(archive: str, name: str) -> str:
     """Return the id of a member."""
     return f"{archive.rpartition('.')[0]}/{name}"
@@ -143,18 +134,6 @@ def member_id(archive: str, name: str) -> str:
 def name_in(archive: str, id: str) -> str:
     """Return the name in its archive of a member of that id."""
     return id[len(archive.rpartition(".")[0]) + 1 :].rstrip("/")
-
-
-def with_archive(archive: str, endings: Sequence[str]) -> int:
-    """Return bits to be added to a member's first byte, which say for :func:`split_place` in which archive it is."""
-    stem, dot, ending = archive.rpartition(".")
-    return (len(stem) * len(endings) + endings.index(dot + ending)) << _PLACE_BITS
-
-
-def split_place(id: str, place: int, endings: Sequence[str]) -> tuple[str, int]:
-    """Return the archive of a member of that id, and its first byte there."""
-    length, ending = divmod(place >> _PLACE_BITS, len(endings))
-    return id[:length] + endings[ending], place & ((1 << _PLACE_BITS) - 1)
 
 
 def find_archive(

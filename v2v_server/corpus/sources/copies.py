@@ -26,7 +26,7 @@ from io import BytesIO
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 from zipfile import Path as ZipPath
 from zipfile import ZipFile
 
@@ -47,12 +47,10 @@ from v2v_server.corpus.sources.archives import (
     ZIP_END_BYTES,
     ZIP_HEAD_BYTES,
     MemberPath,
-    archive_mark,
     directory_bytes,
     find_archive,
     name_in,
     same_ids,
-    split_place,
     zip_head_rest,
 )
 from v2v_server.corpus.sources.copy_folder import CopyFolder
@@ -65,10 +63,12 @@ from v2v_server.corpus.sources.source import (
     NO_STATE,
     UNPRINTABLE,
     FileState,
+    Member,
     SourceOptions,
     VideoSource,
     is_expected,
     mark_of,
+    unmarked,
 )
 from v2v_server.kinds.registry import KINDS, kind_of
 from v2v_server.store.quota import MOST_GIB
@@ -371,24 +371,12 @@ class Copies(VideoSource):
         Raises:
             VideoUnreadable: the store does not answer, or has no such object.
         """
-        if told := self._told(id):
-            return told
+        if member := self.member(id):  # what delivers its bytes checks the archive
+            return unmarked(self, id, member.state)
         if id.endswith("/"):
             return state_of_parts(self, id, self._parts(id, listed, tries))
         size, content, _ = self.bucket.state(id, tries) if listed is None else listed.get(id, GONE)
         return size, content, mark_of(self, id)
-
-    def _told(self, id: str, state: Sequence[int] = ()) -> FileState | None:
-        """Return the state of a member of an archive: ``state``, or what this process was told; None of an object.
-
-        What delivers the member's bytes checks it.
-        """
-        state = state or self.members.get(id) or (self.expected[1] if self.expected[0] == id else ())
-        return cast(FileState, tuple(state)) if state and state[2] != mark_of(self, id) else None
-
-    def _is_of(self, id: str, archive: str, told: FileState) -> Callable[[FileState], bool]:
-        """Return what compares a state of an archive with that of its member."""
-        return lambda state: archive_mark(archive, state) ^ mark_of(self, id) == told[2]
 
     def _parts(
         self, id: str, listed: Mapping[str, FileState] | None = None, tries: int = TRIES
@@ -417,9 +405,8 @@ class Copies(VideoSource):
             if is_sidecar(id):
                 found = self.bucket.find(id, tries=1) if id.endswith("/") else {"": self.bucket.state(id, tries=1)}
                 changed = state_text(sorted(found.items())) != state and state is not None
-            elif told := self._told(id, cast(FileState, state or ())):
-                archive, _ = split_place(id, told[1], self.kind.archive_endings)
-                changed = not self._is_of(id, archive, told)(self.bucket.state(archive, tries=1, member=id))
+            elif member := self.member(id, unmarked(self, id, state) if isinstance(state, tuple) else ()):
+                changed = not member.is_in(self.bucket.state(member.archive, tries=1, member=id))
             elif state is None and self.archive_of(id):
                 return  # in which state it was is not known
             else:
@@ -472,8 +459,8 @@ class Copies(VideoSource):
             VideoChanged: it is another one by now.
         """
         expected = is_expected(self, id)
-        if told := self._told(id):
-            self._write_member(id, told, slot)
+        if member := self.member(id):
+            self._write_member(id, member, slot)
         elif id.endswith("/"):
             self._pack(id, slot)
         else:
@@ -487,27 +474,28 @@ class Copies(VideoSource):
             self._check_content(id, slot, fingerprint)
         return found
 
-    def _write_member(self, id: str, told: FileState, slot: Path) -> None:
+    def _write_member(self, id: str, member: Member, slot: Path) -> None:
         """Fetch a member of an archive with one question.
 
         Raises:
             VideoError: see :meth:`Bucket.read`; or its header in the archive is damaged.
         """
-        archive, start = split_place(id, told[1], self.kind.archive_endings)
-        is_zip, size = archive.endswith(".zip"), told[0]
+        is_zip = member.archive.endswith(".zip")
 
         def use(read: ReadBytes) -> None:
             with slot.open("wb") as file:
                 if is_zip:
                     copy_bytes(read, head := BytesIO(), ZIP_HEAD_BYTES)
                     if (rest := zip_head_rest(head.getvalue(), -1)) < 0:
-                        raise VideoError(id, None, f"its header in {archive} is damaged: upload the archive again")
+                        raise VideoError(
+                            id, None, f"its header in {member.archive} is damaged: upload the archive again"
+                        )
                     copy_bytes(read, BytesIO(), rest)
-                copy_bytes(read, file, size)
+                copy_bytes(read, file, member.size)
 
         # One byte at least: there is no range of none.
-        part = start, start + (MOST_ZIP_HEAD_BYTES if is_zip else 0) + max(size, 1)
-        self.bucket.read(archive, part, self._is_of(id, archive, told), use, member=id)
+        part = member.start, member.start + (MOST_ZIP_HEAD_BYTES if is_zip else 0) + max(member.size, 1)
+        self.bucket.read(member.archive, part, member.is_in, use, member=id)
 
     @contextlib.contextmanager
     def lend_archive(self, archive: str, state: FileState) -> Iterator[str]:
