@@ -17,7 +17,7 @@ from v2v_protocol.errors import VideoError
 from v2v_server.corpus.index import FigureKind, Figures, Store
 from v2v_server.corpus.probe import LARGEST_PROBE_BYTES, LONGEST_SECONDS
 from v2v_server.corpus.sources import archives
-from v2v_server.corpus.sources.archives import ArchiveTable, HasArchives, member_id
+from v2v_server.corpus.sources.archives import DEFLATE_RATIO, ArchiveTable, HasArchives, member_id
 from v2v_server.corpus.sources.listing import Notice
 from v2v_server.corpus.sources.source import FileState, Member, VideoSource, archive_mark
 from v2v_server.system.isolate import Died, run_lent
@@ -78,7 +78,7 @@ def _tables(
         if (known := store.figures(archive, str(state), _KIND)) is None:
             stale.append((archive, state))
         else:
-            yield archive, state, _decoded(known, state)
+            yield archive, state, _decoded(source, archive, known, state)
 
     @contextmanager
     def lend(item: _Archive) -> Iterator[_Job]:
@@ -97,15 +97,16 @@ def _tables(
         elif not (why := result[1]):
             with suppress(sqlite3.Error):  # an index that cannot be written costs the next start this time again
                 store.put_figures(_KIND, [Figures(archive, str(state), b"", result[0])])
-            yield archive, state, _decoded(result[0], state)
+            yield archive, state, _decoded(source, archive, result[0], state)
         if why:
             yield archive, state, why
 
 
-def _decoded(data: bytes, state: FileState) -> ArchiveTable | str:
+def _decoded(source: VideoSource, archive: str, data: bytes, state: FileState) -> ArchiveTable | str:
+    is_inflated = archive.endswith(".zip") and not source.is_local
     try:
         problem, table = msgpack.unpackb(data)
-        return str(problem) or ArchiveTable.from_bytes(table, state[0])
+        return str(problem) or ArchiveTable.from_bytes(table, state[0] * (DEFLATE_RATIO if is_inflated else 1))
     except (ValueError, TypeError) as error:
         return f"its table is damaged ({error})"
 

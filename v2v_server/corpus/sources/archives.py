@@ -22,7 +22,7 @@ from dataclasses import dataclass, field, replace
 from importlib.resources.abc import Traversable
 from types import SimpleNamespace
 from typing import IO, Any, Protocol, Self
-from zipfile import ZIP_STORED, BadZipFile, ZipFile, ZipInfo
+from zipfile import ZIP_DEFLATED, ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 
 import msgpack
 import numpy as np
@@ -39,6 +39,8 @@ _LARGEST_TABLE_BYTES = 48 << 20
 _LEAVES = re.compile(r"(?:^|[/\n])\.{0,2}(?:[/\n]|$)")
 """A name that is absolute, leads out of its folder, or has an empty part; in one text or in lines."""
 ZIP_HEAD_BYTES, _ZIP_HEAD = 30, b"PK\3\4"
+DEFLATE_RATIO = 1032
+"""Largest number of bytes that a byte of a deflated member may stand for."""
 MOST_ZIP_HEAD_BYTES = ZIP_HEAD_BYTES + 2 * 65535
 """Largest header of a member of a zip file: name and extra fields follow the first bytes."""
 ZIP_END_BYTES, MOST_DIRECTORY_BYTES = 1 << 17, 256 << 20
@@ -245,11 +247,11 @@ def _zip_members(file: IO[bytes], is_remote: bool) -> Iterator[tuple[str, int, i
         for entry in packed.infolist():
             if entry.is_dir():
                 continue
-            start, problem = entry.header_offset, _packed(entry)
+            start, problem = entry.header_offset, _packed(entry, is_remote)
             if not problem:
                 file.seek(start)
                 start += 0 if is_remote else ZIP_HEAD_BYTES + zip_head_rest(file.read(ZIP_HEAD_BYTES), end)
-                if start + entry.file_size > end:
+                if start + entry.compress_size > end:
                     problem = "lies beyond the end of the archive, or its header is damaged: fetch it again"
             yield entry.filename, start, entry.file_size, problem
 
@@ -264,6 +266,11 @@ def zip_head_rest(head: bytes, otherwise: int) -> int:
     return sum(struct.unpack("<HH", head[26:])) if head.startswith(_ZIP_HEAD) and len(head) == 30 else otherwise
 
 
+def is_deflated(head: bytes) -> bool:
+    """Return whether a member of a zip file is deflated, by the first bytes of its header."""
+    return int.from_bytes(head[8:10], "little") == ZIP_DEFLATED
+
+
 def directory_bytes(end: bytes) -> int:
     """Return how many of the last bytes of a zip file hold its directory, by the last :data:`ZIP_END_BYTES`."""
     at = end.rfind(b"PK\5\6")
@@ -274,11 +281,15 @@ def directory_bytes(end: bytes) -> int:
     return len(end) - at + length + 1024 if at >= 0 else 0  # what lies behind the directory has less
 
 
-def _packed(entry: ZipInfo) -> str:
+def _packed(entry: ZipInfo, is_remote: bool) -> str:
     if entry.flag_bits & 1:
         return "is encrypted: unpack the archive"
-    if entry.compress_type != ZIP_STORED or entry.compress_size != entry.file_size:
-        return "is compressed, and cannot be read in place: unpack the archive, or pack it with zip -0"
+    is_stored = entry.compress_type == ZIP_STORED and entry.compress_size == entry.file_size
+    if not is_stored and not (is_remote and entry.compress_type == ZIP_DEFLATED):
+        return (
+            "is compressed, and cannot be read in place: unpack the archive, pack it with zip -0, or name its folder "
+            "as file:///PATH, to have deflated videos copied first"
+        )
     return "is a link: unpack the archive" if stat.S_ISLNK(entry.external_attr >> 16) else ""
 
 

@@ -14,6 +14,7 @@ import posixpath
 import random
 import re
 import time
+import zlib
 from array import array
 from bisect import bisect_left
 from collections import Counter
@@ -49,13 +50,14 @@ from v2v_server.corpus.sources.archives import (
     MemberPath,
     directory_bytes,
     find_archive,
+    is_deflated,
     name_in,
     same_ids,
     zip_head_rest,
 )
 from v2v_server.corpus.sources.copy_folder import CopyFolder
 from v2v_server.corpus.sources.listing import ListEntry, answers, count_left_out
-from v2v_server.corpus.sources.object_parts import PART_BYTES, ReadBytes, copy_bytes, open_part
+from v2v_server.corpus.sources.object_parts import PART_BYTES, ReadBytes, copy_bytes, inflate, open_part
 from v2v_server.corpus.sources.sidecars import is_sidecar, sidecar_fingerprint, state_of_parts, state_text
 from v2v_server.corpus.sources.source import (
     GONE,
@@ -491,10 +493,19 @@ class Copies(VideoSource):
                             id, None, f"its header in {member.archive} is damaged: upload the archive again"
                         )
                     copy_bytes(read, BytesIO(), rest)
-                copy_bytes(read, file, member.size)
+                if is_zip and is_deflated(head.getvalue()):
+                    try:
+                        inflate(read, file, member.size)
+                    except (zlib.error, ValueError) as error:
+                        raise VideoError(
+                            id, None, f"cannot be inflated ({error}): upload {member.archive} again"
+                        ) from error
+                else:
+                    copy_bytes(read, file, member.size)
 
-        # One byte at least: there is no range of none.
-        part = member.start, member.start + (MOST_ZIP_HEAD_BYTES if is_zip else 0) + max(member.size, 1)
+        # One byte at least: there is no range of none. Deflated bytes may be a few more than those that they stand for.
+        more = MOST_ZIP_HEAD_BYTES + member.size // 1000 if is_zip else 0
+        part = member.start, member.start + more + max(member.size, 1)
         self.bucket.read(member.archive, part, member.is_in, use, member=id)
 
     @contextlib.contextmanager

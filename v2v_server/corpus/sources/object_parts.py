@@ -6,6 +6,7 @@ and no other one can come in between. Of other stores the state is asked for bef
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -77,3 +78,26 @@ def copy_bytes(read: ReadBytes, file: IO[bytes], size: int) -> None:
             raise EOFError("its answer ends early")
         file.write(block)
         size -= len(block)
+
+
+def inflate(read: ReadBytes, file: IO[bytes], size: int) -> None:
+    """Write what the next bytes stand for, which are deflated.
+
+    Args:
+        size: of what they stand for, as their archive states it, bytes: no more are written.
+
+    Raises:
+        EOFError: there are fewer.
+        ValueError: they stand for more bytes, or fewer.
+        zlib.error: they are damaged.
+    """
+    inflater, left = zlib.decompressobj(-zlib.MAX_WBITS), size
+    while not inflater.eof:
+        if not (data := inflater.unconsumed_tail or read(PART_BYTES)):
+            raise EOFError("its answer ends early")
+        block = inflater.decompress(data, PART_BYTES)
+        if (left := left - len(block)) < 0:
+            break
+        file.write(block)
+    if left:
+        raise ValueError(f"it has {'more' if left < 0 else 'fewer'} than the {size} bytes that its archive states")

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
+from zipfile import ZIP_DEFLATED
 
 import pytest
 
@@ -24,6 +25,7 @@ from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.sources import archives
 from v2v_server.corpus.sources.archives import CUT, LEAVES
 from v2v_server.corpus.sources.copies import Bucket
+from v2v_server.prepare import prepare
 
 __all__ = ["web"]
 pytest.importorskip("aiohttp", reason="the extra 'cloud' is not installed")
@@ -265,3 +267,41 @@ def test_labels_in_archives_of_a_store_are_refused_in_words(plain: Path, tmp_pat
             "2 sidecars cannot be read and count as missing (0/a.boxes.json: lies in an archive of object storage, "
             "where none is read: unpack it)",
         )
+
+
+def test_deflated_members_are_inflated_while_they_are_copied(plain: Path, tmp_path: Path, web: Web) -> None:
+    """They have the catalogue, samples and prepared files of the folder."""
+    corpus, clip = tmp_path / "corpus", (plain / "0" / "a.mp4").read_bytes()
+    corpus.mkdir()
+    padded = clip + bytes(3 << 20)  # more than the zip file has
+    zip_of(corpus / "0.zip", ("a.mp4", clip), ("b.mp4", padded), method=ZIP_DEFLATED)
+    for name, data in (("a.mp4", clip), ("b.mp4", padded)):
+        (tmp_path / "unpacked" / "0").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "unpacked" / "0" / name).write_bytes(data)
+    with opened(tmp_path / "unpacked", tmp_path / "plain") as catalogue:
+        reference = snapshot(catalogue)
+        prepare(catalogue, tmp_path / "store" / "plain", processes=0)
+    for address in (serve(web, corpus), f"file://{corpus}"):
+        with opened(address, tmp_path) as catalogue:
+            assert snapshot(catalogue) == reference
+            prepare(catalogue, tmp_path / "store" / "zip", processes=0)
+    for name in ("0/a.mp4", "0/b.mp4"):
+        files = [tmp_path / "store" / form / name for form in ("plain", "zip")]
+        assert files[0].read_bytes() == files[1].read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [(-1, "it has more than the"), (1, "it has fewer than the"), (0, "cannot be inflated")],
+)
+def test_a_member_that_inflates_to_another_size_is_refused(change: int, expected: str, tmp_path: Path) -> None:
+    corpus = tmp_path / "corpus"
+    write_clip(corpus / "y" / "good.mp4", panned_luma(24, 32, 40))
+    data = zip_of(corpus / "x.zip", ("a.mp4", CLIP), method=ZIP_DEFLATED)
+    size = len(CLIP).to_bytes(4, "little")
+    changed = data.replace(size, (len(CLIP) + change).to_bytes(4, "little"))
+    at = data.index(b"a.mp4") + 5
+    (corpus / "x.zip").write_bytes(changed if change else data[:at] + b"\xff" * 9 + data[at + 9 :])
+    with opened(f"file://{corpus}", tmp_path) as catalogue:
+        (refusal,) = catalogue.refusals
+    assert (refusal.video, expected in refusal.reason) == ("x/a.mp4", True), refusal
