@@ -102,6 +102,10 @@ class VideosKind:
         """Return the id of the video that a file belongs to, by its relative path; "" if it belongs to none."""
         return path if path.lower().endswith(self.endings) else ""
 
+    def entry_of(self, path: str) -> str:
+        """Return the same; or the path, if the file is an archive whose members may be videos."""
+        return self.id_of(path) or (path if path.endswith(self.archive_endings) else "")
+
     def listed_id(self, path: PurePosixPath) -> str:
         """Return the id of the video that a list names by this path; "" if it cannot name one."""
         return str(path) if _SUFFIX.fullmatch(path.suffix) else ""
