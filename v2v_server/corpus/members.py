@@ -19,7 +19,7 @@ from v2v_server.corpus.probe import LARGEST_PROBE_BYTES, LONGEST_SECONDS
 from v2v_server.corpus.sources import archives
 from v2v_server.corpus.sources.archives import DEFLATE_RATIO, ArchiveTable, HasArchives, member_id
 from v2v_server.corpus.sources.listing import Notice
-from v2v_server.corpus.sources.source import FileState, Member, VideoSource, archive_mark
+from v2v_server.corpus.sources.source import FileState, MemberPlace, VideoSource, archive_mark
 from v2v_server.system.isolate import Died, run_lent
 
 _Archive = tuple[str, FileState]
@@ -55,7 +55,7 @@ def list_members(
         for name, (size, start) in zip(table.names, table.places.tolist(), strict=True):
             id = member_id(archive, name)
             if kind.id_of(id) and (takes_all or (wanted and id in wanted)):
-                source.members[id] = Member(archive, size, start, mark).state
+                source.members[id] = MemberPlace(archive, size, start, mark).state
                 found.append(id)
         refused.update((member_id(archive, name), reason) for name, reason in table.refused)
         for note in table.notes:

@@ -1,8 +1,8 @@
 """Archives whose members are videos where they lie: tar files, and zip files without compression.
 
 The id of a member is the archive's path without its ending, a slash, and the member's name: that of the file in the
-folder that the archive unpacks to. The state of a member says where it lies (:class:`Member` of ``source``). So a job
-or lease, which has the state of its video, says where to read it, and only the process that makes the table of an
+folder that the archive unpacks to. The state of a member says where it lies (:class:`MemberPlace` of ``source``). So a
+job or lease, which has the state of its video, says where to read it, and only the process that makes the table of an
 archive parses one.
 """
 

@@ -65,7 +65,7 @@ from v2v_server.corpus.sources.source import (
     NO_STATE,
     UNPRINTABLE,
     FileState,
-    Member,
+    MemberPlace,
     SourceOptions,
     VideoSource,
     is_expected,
@@ -476,12 +476,15 @@ class Copies(VideoSource):
             self._check_content(id, slot, fingerprint)
         return found
 
-    def _write_member(self, id: str, member: Member, slot: Path) -> None:
+    def _write_member(self, id: str, member: MemberPlace, slot: Path) -> None:
         """Fetch a member of an archive with one question.
 
         Raises:
-            VideoError: see :meth:`Bucket.read`; or its header in the archive is damaged.
+            VideoError: see :meth:`Bucket.read`; or it is damaged in the archive.
+            VideoUnreadable: it is larger than all copies may be. Few deflated bytes can stand for a full disk.
         """
+        if member.size > self.copies.most_bytes:
+            raise VideoUnreadable(id, None, f"its {member.size} bytes exceed the limit of copies: raise --copies-gib")
         is_zip = member.archive.endswith(".zip")
 
         def use(read: ReadBytes) -> None:

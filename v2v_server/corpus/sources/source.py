@@ -53,7 +53,7 @@ _IS_MEMBER = 1 << 62
 
 
 @dataclass(frozen=True, slots=True)
-class Member:
+class MemberPlace:
     """Where the bytes of a video lie in an archive. Its state says that, so what has the state reads no table.
 
     Attributes:
@@ -76,7 +76,7 @@ class Member:
         return self.size, place << _START_BITS | self.start, self.mark
 
     @classmethod
-    def of(cls, id: str, state: Sequence[int]) -> Member | None:
+    def of(cls, id: str, state: Sequence[int]) -> MemberPlace | None:
         """Return where a video of that state lies; None if it is a file of its own."""
         if not state or state[2] < _IS_MEMBER:
             return None
@@ -204,14 +204,14 @@ class VideoSource(ABC):
             CorpusError: the source cannot be listed, or cannot be served.
         """
 
-    def member(self, id: str, state: Sequence[int] = ()) -> Member | None:
+    def member(self, id: str, state: Sequence[int] = ()) -> MemberPlace | None:
         """Return where a video lies in an archive; None if it is a file of its own, or this process was not told.
 
         Args:
             state: as catalogued, without :func:`mark_of`; empty: as this process was told.
         """
         told = self.expected[1] if self.expected[0] == id else ()
-        return Member.of(id, state or self.members.get(id) or told)
+        return MemberPlace.of(id, state or self.members.get(id) or told)
 
     @abstractmethod
     def state(self, id: str) -> FileState:

@@ -13,6 +13,8 @@ from typing import Any
 from zipfile import ZIP_DEFLATED
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from tests.clips import panned_luma, write_clip
 from tests.digests.rows import Row, samples_of
@@ -25,6 +27,7 @@ from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.sources import archives
 from v2v_server.corpus.sources.archives import CUT, LEAVES
 from v2v_server.corpus.sources.copies import Bucket
+from v2v_server.corpus.sources.source import MemberPlace, archive_mark
 from v2v_server.prepare import prepare
 
 __all__ = ["web"]
@@ -288,6 +291,35 @@ def test_deflated_members_are_inflated_while_they_are_copied(plain: Path, tmp_pa
     for name in ("0/a.mp4", "0/b.mp4"):
         files = [tmp_path / "store" / form / name for form in ("plain", "zip")]
         assert files[0].read_bytes() == files[1].read_bytes()
+
+
+def test_a_member_larger_than_all_copies_is_not_begun(tmp_path: Path) -> None:
+    corpus = tmp_path / "corpus"
+    write_clip(corpus / "y" / "good.mp4", panned_luma(24, 32, 40))
+    zip_of(corpus / "x.zip", ("a.mp4", bytes(4 << 20)), method=ZIP_DEFLATED)
+    with opened(f"file://{corpus}", tmp_path, copies_gib=1 / 512) as catalogue:
+        assert [(each.video, each.reason) for each in catalogue.refusals] == [
+            ("x/a.mp4", "its 4194304 bytes exceed the limit of copies: raise --copies-gib")
+        ]
+
+
+@given(
+    st.integers(0, 2**40),
+    st.integers(0, 2**48 - 1),
+    st.tuples(*[st.integers(0, 2**63 - 1)] * 3),
+    st.sampled_from([".tar", ".zip"]),
+    st.text("ab/.", min_size=1, max_size=1024),
+)
+def test_the_state_of_a_member_says_where_it_lies(
+    size: int, start: int, state: tuple[int, int, int], ending: str, stem: str
+) -> None:
+    """In numbers that a message and the index can hold."""
+    archive = stem + ending
+    member = MemberPlace(archive, size, start, archive_mark(archive, state))
+    assert MemberPlace.of(f"{stem}/a.mp4", member.state) == member
+    assert all(0 <= number < 2**63 for number in member.state)
+    assert member.is_in(state)
+    assert MemberPlace.of(f"{stem}/a.mp4", (size, 1_700_000_000_000_000_000, 1_700_000_000_000_000_000)) is None
 
 
 @pytest.mark.parametrize(
