@@ -48,17 +48,20 @@ def lines(seed: int, size: int = 240) -> Grey:
         angle, place = random.uniform(0, np.pi), random.uniform(-size / 2, size / 2)
         distance = y * np.cos(angle) + x * np.sin(angle) - place
         light += (-0.4 if number % 2 else 0.3) * np.exp(-0.5 * (distance / 0.8) ** 2)
-    return np.rint(np.clip(light, 0.0, 1.0) * 65535).astype(np.uint16)
+    levels: Grey = np.rint(np.clip(light, 0.0, 1.0) * 65535).astype(np.uint16)
+    return levels
 
 
 def pale(name: str) -> Grey:
     """Return a photograph with a twelfth of its contrast."""
-    return np.rint((128 + (photograph(name) - 128.0) / 12) * 257).astype(np.uint16)
+    levels: Grey = np.rint((128 + (photograph(name) - 128.0) / 12) * 257).astype(np.uint16)
+    return levels
 
 
 def scenes(choosing: bool) -> dict[str, Callable[[], list[Grey]]]:
     """Return the photographs of each scene; those that a share is chosen on are none of those that are reported."""
-    names, seeds, periods = (("coins", "gravel"), (5, 6), (12.0, 20.0))
+    names: tuple[str, ...] = ("coins", "gravel")
+    seeds, periods = (5, 6), (12.0, 20.0)
     if not choosing:
         names, seeds, periods = ("coffee", "astronaut", "camera"), (1, 2), (8.0, 32.0)
     return {

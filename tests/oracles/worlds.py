@@ -179,7 +179,8 @@ def waves(grey: tuple[float, float], period_px: float, size: int = 240) -> npt.N
     y, x = np.mgrid[:size, :size] + 0.5
     sines = np.sin(2 * np.pi * x / period_px) + np.sin(2 * np.pi * y / period_px + 1.0)
     light = (grey[0] + grey[1]) / 2 + (grey[1] - grey[0]) / 4 * sines
-    return np.floor(light * (65535 / 255) + 0.5).astype(np.uint16)
+    levels: npt.NDArray[np.uint16] = np.floor(light * (65535 / 255) + 0.5).astype(np.uint16)
+    return levels
 
 
 def event_counts(
