@@ -25,7 +25,6 @@ four of every eight frames, rounded to 1/64 px a frame.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from contextlib import nullcontext
 from itertools import islice
 
 import cv2
@@ -129,8 +128,7 @@ class SceneAnalysis:
 
     def add(self, picture: GreyPicture) -> None:
         """Add the next frame: [h, w] uint8, full-range luma, upright, of the size of the others."""
-        # OpenCV has work only in the first two of four frames.
-        with one_thread() if self._frames % LAG_FRAMES < 2 else nullcontext():
+        with one_thread():
             self._add(np.ascontiguousarray(picture))
 
     def _add(self, picture: GreyPicture) -> None:
