@@ -373,7 +373,7 @@ class Copies(VideoSource):
         Raises:
             VideoUnreadable: the store does not answer, or has no such object.
         """
-        if member := self.member(id):  # what delivers its bytes checks the archive
+        if member := self._member(id):  # what delivers its bytes checks the archive
             return unmarked(self, id, member.state)
         if id.endswith("/"):
             return state_of_parts(self, id, self._parts(id, listed, tries))
@@ -407,7 +407,7 @@ class Copies(VideoSource):
             if is_sidecar(id):
                 found = self.bucket.find(id, tries=1) if id.endswith("/") else {"": self.bucket.state(id, tries=1)}
                 changed = state_text(sorted(found.items())) != state and state is not None
-            elif member := self.member(id, unmarked(self, id, state) if isinstance(state, tuple) else ()):
+            elif member := self._member(id, unmarked(self, id, state) if isinstance(state, tuple) else ()):
                 changed = not member.is_in(self.bucket.state(member.archive, tries=1, member=id))
             elif state is None and self.archive_of(id):
                 return  # in which state it was is not known
@@ -461,7 +461,7 @@ class Copies(VideoSource):
             VideoChanged: it is another one by now.
         """
         expected = is_expected(self, id)
-        if member := self.member(id):
+        if member := self._member(id):
             self._write_member(id, member, slot)
         elif id.endswith("/"):
             self._pack(id, slot)

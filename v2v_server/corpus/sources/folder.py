@@ -97,7 +97,7 @@ class Folder(VideoSource):
         try:
             if path.endswith("/"):
                 return state_of_parts(self, id, [(name, _numbers(status)) for name, status in files_in(path)])
-            if (member := self.member(id)) is not None:
+            if (member := self._member(id)) is not None:
                 mark = archive_mark(member.archive, _numbers(os.stat(self.path_of(member.archive))))
                 return unmarked(self, id, replace(member, mark=mark).state)
             status = os.stat(path)
@@ -116,7 +116,7 @@ class Folder(VideoSource):
 
     def _file(self, id: str) -> Path:
         """Return a video's file, or the part of an archive that is one."""
-        if (member := self.member(id)) is None:
+        if (member := self._member(id)) is None:
             return Path(self.path_of(id))
         return cast(Path, FileRange(self.path_of(member.archive), member.start, member.start + member.size))
 

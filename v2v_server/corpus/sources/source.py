@@ -204,7 +204,7 @@ class VideoSource(ABC):
             CorpusError: the source cannot be listed, or cannot be served.
         """
 
-    def member(self, id: str, state: Sequence[int] = ()) -> MemberPlace | None:
+    def _member(self, id: str, state: Sequence[int] = ()) -> MemberPlace | None:
         """Return where a video lies in an archive; None if it is a file of its own, or this process was not told.
 
         Args:
