@@ -231,7 +231,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit status. ``export`` or ``data`` in place of a configuration has flags of its own."""
+    """Run the command line; return the exit status. ``export`` and ``data`` are commands of their own."""
     given = sys.argv[1:] if argv is None else argv
     for word, other in (("export", export.main), ("data", data.main)):
         if given[:1] == [word]:

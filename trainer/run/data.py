@@ -2,7 +2,7 @@
 
 ``trainer/configs/firenet-cpu.csv`` lists photographs of the installed scikit-image, each with the licence that its
 documentation states. The others are drawn here, as dead leaves: opaque shapes of all sizes in front of each other, with
-textures. Their edges, occlusions and greys are distributed as those of photographs are, and they belong to this project.
+textures. Such pictures share edges, occlusions and greys with photographs, and they belong to this project.
 """
 
 from __future__ import annotations
@@ -22,13 +22,7 @@ from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError
 
 LISTS = Path(__file__).parents[1] / "configs"
-LEAVES = 30
-"""Pictures that are drawn for training."""
-_SIDE_PX = 512
-_SHAPES = 800
-_LEAST_PX, _MOST_PX = 9.0, 160.0
-
-Grey = NDArray[np.float64]
+DRAWN, _SIDE_PX, _SHAPES, _LEAST_PX, _MOST_PX = 30, 512, 800, 9.0, 160.0
 
 
 def collect(configuration: str, out: Path) -> int:
@@ -36,26 +30,24 @@ def collect(configuration: str, out: Path) -> int:
 
     Raises:
         UsageError: the configuration has no list, or the installed scikit-image has other pictures than listed.
+        OSError: a picture cannot be written.
     """
-    listed = LISTS / f"{configuration}.csv"
-    if not listed.is_file():
-        known = ", ".join(sorted(path.stem for path in LISTS.glob("*.csv")))
-        raise UsageError(f"{configuration!r} has no list of pictures; give one of: {known}")
-    rows = list(csv.DictReader(listed.read_text().splitlines()))
+    lists = {path.stem: path for path in sorted(LISTS.glob("*.csv"))}
+    if configuration not in lists:
+        raise UsageError(f"{configuration!r} has no list of pictures; give one of: {', '.join(lists)}")
+    rows = list(csv.DictReader(lists[configuration].read_text().splitlines()))
+    folders = {part: out / part / "photographs" for part in ("training", "held-out")}
+    for folder in folders.values():
+        folder.mkdir(parents=True, exist_ok=True)
     for row in rows:
         picture = files("skimage.data") / row["file"]
         data = picture.read_bytes() if picture.is_file() else b""
-        if digest_of(data) != row["sha256"]:
-            raise UsageError(f"{picture}: not the listed picture; pip install scikit-image==0.26.0 has it")
-        _place(out, row["set"], row["file"]).write_bytes(data)
-    for number in range(LEAVES):
-        Image.fromarray(dead_leaves(number)).save(_place(out, "training", f"leaves-{number:02}.png"))
-    return len(rows) + LEAVES
-
-
-def digest_of(data: bytes) -> str:
-    """Return the first 16 hexadecimal digits of the SHA-256 of a file."""
-    return hashlib.sha256(data).hexdigest()[:16]
+        if not hashlib.sha256(data).hexdigest().startswith(row["sha256"]):
+            raise UsageError(f"{picture}: missing, or not the listed picture; pip install scikit-image==0.26.0 has it")
+        (folders[row["set"]] / row["file"]).write_bytes(data)
+    for number in range(DRAWN):
+        Image.fromarray(dead_leaves(number)).save(folders["training"] / f"leaves-{number:02}.png")
+    return len(rows) + DRAWN
 
 
 def dead_leaves(seed: int) -> NDArray[np.uint8]:
@@ -65,33 +57,26 @@ def dead_leaves(seed: int) -> NDArray[np.uint8]:
     picture = 0.5 + 0.1 * _texture(random)
     texture = _texture(random)
     # Probability falls with the cube of the size: the picture then looks the same at any zoom.
-    sizes = (_MOST_PX**-2 + random.random(_SHAPES) * (_LEAST_PX**-2 - _MOST_PX**-2)) ** -0.5
-    for size in sizes:
+    for size in (_MOST_PX**-2 + random.random(_SHAPES) * (_LEAST_PX**-2 - _MOST_PX**-2)) ** -0.5:
         row, column = random.uniform(0, _SIDE_PX, 2)
         angle, stretch, grey = random.uniform(0, np.pi), random.uniform(0.4, 1), random.beta(0.8, 0.8)
-        down, right = (slice(max(int(at - size), 0), int(at + size) + 1) for at in (row, column))
-        y, x = rows[down, right] - row, columns[down, right] - column
+        box = tuple(slice(max(int(at - size), 0), int(at + size) + 1) for at in (row, column))
+        y, x = rows[box] - row, columns[box] - column
         u, v = np.cos(angle) * x + np.sin(angle) * y, (np.cos(angle) * y - np.sin(angle) * x) / stretch
         inside = (u**2 + v**2 < size**2) if random.random() < 0.6 else (np.maximum(abs(u), abs(v)) < 0.7 * size)
-        shade = grey + random.normal(0, 0.15) * u / size + random.exponential(0.06) * texture[down, right]
+        shade = grey + random.normal(0, 0.15) * u / size + random.exponential(0.06) * texture[box]
         if random.random() < 0.2:
             shade = shade + random.uniform(0.05, 0.3) * np.sign(np.sin(u * random.uniform(0.2, 1.2)))
-        picture[down, right] = np.where(inside, shade, picture[down, right])
+        picture[box] = np.where(inside, shade, picture[box])
     return np.rint(255 * picture.clip(0, 1)).astype(np.uint8)
 
 
-def _texture(random: np.random.Generator) -> Grey:
+def _texture(random: np.random.Generator) -> NDArray[np.float64]:
     """Draw noise whose amplitude falls with frequency, as that of photographs does: mean 0, deviation 1."""
     frequency = np.hypot(np.fft.fftfreq(_SIDE_PX)[:, None], np.fft.rfftfreq(_SIDE_PX))
     frequency[0, 0] = np.inf
     noise = np.fft.irfft2(np.fft.rfft2(random.normal(size=(_SIDE_PX, _SIDE_PX))) / frequency)
     return np.asarray(noise / noise.std())
-
-
-def _place(out: Path, part: str, name: str) -> Path:
-    folder = out / part / "photographs"
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder / name
 
 
 def _run(asked: argparse.Namespace) -> int:
