@@ -178,7 +178,8 @@ def wrong_with(words: list[str]) -> str:
         return _wrong_with_launched(rest)
     if program not in MODULES:
         return "no program"
-    return _refused(parser_of(module_of(program, rest)), [word for word in rest if word not in ("export", "data")])
+    mode = rest[:1] in (["export"], ["data"])
+    return _refused(parser_of(module_of(program, rest)), rest[mode:])
 
 
 def _wrong_with_launched(words: list[str]) -> str:

@@ -68,7 +68,7 @@ def dead_leaves(seed: int) -> NDArray[np.uint8]:
         if random.random() < 0.2:
             shade = shade + random.uniform(0.05, 0.3) * np.sign(np.sin(u * random.uniform(0.2, 1.2)))
         picture[box] = np.where(inside, shade, picture[box])
-    return np.rint(255 * picture.clip(0, 1)).astype(np.uint8)
+    return np.asarray(np.rint(255 * picture.clip(0, 1)), np.uint8)
 
 
 def _texture(random: np.random.Generator) -> NDArray[np.float64]:
