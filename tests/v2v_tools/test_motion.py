@@ -185,7 +185,7 @@ SMALL = FAST._replace(lost=210)
     [
         (MeasuredMotion(), ("0 px", "0 px", "0%", "0%", "0%"), ""),
         (QUIET, ("1 px", "1 px", "7%", "12%", "3%"), ""),
-        (FAST, ("3 px", "5 px", "7%", "12%", "3%"), f"{motion.JUDGE} tells the error without and with sub-steps"),
+        (FAST, ("3 px", "5 px", "7%", "12%", "3%"), f"{motion.JUDGE} tells the error without and with sub-steps, at twice this motion"),
         (SMALL, ("3 px", "5 px", "7%", "12%", "21%"), "something small or fast moves, or flickers, or is noise: "
          "sub-steps do not help"),
     ],

@@ -129,15 +129,14 @@ def settings(forms: Sequence[str], spec: StreamSpec, varied: Axes) -> list[Serve
 
 def halves(spec: StreamSpec) -> tuple[StreamSpec, StreamSpec]:
     """Return two streams of the same sequences: one of all frames without sub-steps, one with every second frame left
-    out. Nothing in them is random but the crop: no noise, no pauses. Grids are counted in frames.
+    out. Nothing in them is random but the crop: no noise, no pauses. Grids are counted in frames, and there are two
+    at least, so that they can be halved.
 
     Raises:
-        UsageError: the recipe has a single grid, or its ``frame_stride`` cannot be doubled.
+        UsageError: ``frame_stride`` cannot be doubled.
     """
     recipe = spec.recipe
-    count = recipe.voxels_per_clip // 2
-    if not count:
-        raise UsageError("voxels_per_clip = 1: the error at twice the motion needs 2 or more")
+    count = max(1, recipe.voxels_per_clip // 2)
     both = recipe.replace(
         voxels_per_clip=2 * count, lead_frames=0, lead_voxels=0, voxel_seconds=(0.0, 0.0), noise_sigma=(0.0, 0.0),
         hot_pixel_share=(0.0, 0.0), shot_noise_hz=(0.0, 0.0), leak_hz=(0.0, 0.0), pause_probability=0.0,
