@@ -20,7 +20,7 @@ unexport PYTHONDONTWRITEBYTECODE
 help:
 	@echo "make picture         the first picture, of a clip or of VIDEO=my.mp4, and how long it took: out/preview.png"
 	@echo "make demo            reconstruct a clip, stream real ones through a server, train on them; leaves out/*.png"
-	@echo "make test            the fast tests (four minutes on two cores, the first time)"
+	@echo "make test            the fast tests (twelve minutes on two cores)"
 	@echo "make test-slow       the tests that take longer"
 	@echo "make test-old-numpy  the table of digests under an older numpy, and OpenCV without contrib"
 	@echo "make check           formatting, lint, types; the snippets and command lines of the pages"

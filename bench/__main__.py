@@ -40,6 +40,7 @@ BENCHES = {
     "physics": "accuracy.physics",
     "motion": "speed.motion",
     "substeps": "accuracy.substeps",
+    "worlds": "accuracy.worlds",
     "fit": "accuracy.fit",
     "sensor": "accuracy.sensor",
     "scene": "accuracy.scene",

@@ -44,7 +44,6 @@ _LAUNCHED = {
     "examples/overfit.py": "examples.overfit",
     "examples/detect.py": "examples.detect",
     "examples/render_sprites.py": "examples.render_sprites",
-    "examples.firenet_data": "examples.firenet_data",
     "examples.ray_train": "examples.ray_train",
     "trainer.run.export": "trainer.run.export",
     "tests.tools.trace": "tests.tools.trace",
@@ -52,6 +51,7 @@ _LAUNCHED = {
 """What `python` and `torchrun` start beside benches."""
 _MODES = {
     ("v2v-train", "export"): "trainer.run.export",
+    ("v2v-train", "data"): "trainer.run.data",
     ("v2v-simulate", "--whole"): "v2v_tools.whole",
     ("v2v-simulate", "--count"): "v2v_tools.sample_set",
 }
@@ -68,7 +68,7 @@ PAGES = sorted(
 )
 """Decisions and notes are of their day, and stay as they were."""
 _LINE = re.compile(r"\b(v2v[- ][a-z]+)((?: [^\n`|;&#)]*)?)")
-_WORD = re.compile(r"(?<=\s)(--[a-z][a-z-]*|export)")
+_WORD = re.compile(r"(?<=\s)(--[a-z][a-z-]*|export|data(?= firenet))")
 
 
 class _Caught(Exception):
@@ -178,7 +178,8 @@ def wrong_with(words: list[str]) -> str:
         return _wrong_with_launched(rest)
     if program not in MODULES:
         return "no program"
-    return _refused(parser_of(module_of(program, rest)), [word for word in rest if word != "export"])
+    mode = rest[:1] in (["export"], ["data"])
+    return _refused(parser_of(module_of(program, rest)), rest[mode:])
 
 
 def _wrong_with_launched(words: list[str]) -> str:

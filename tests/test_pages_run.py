@@ -134,7 +134,9 @@ def test_documented_commands_run(
             smaller = []
         if "--count" in given:
             smaller = [*smaller, "--count", "2"]
-        if program == "v2v-train":
+        if given[:1] == ["data"]:  # it trains nothing
+            smaller = []
+        elif program == "v2v-train":
             smaller = [*smaller, "--set", "run.steps=2"]
         if "--cache" in given:
             smaller = [*smaller, "--cache", "decoded"]

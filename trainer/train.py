@@ -17,7 +17,7 @@ from trainer.config_file import load_config, shipped, show_config
 from trainer.feed import flags_of
 from trainer.learner import build, obeying_weights
 from trainer.loop import Diverged, train
-from trainer.run import export
+from trainer.run import data, export
 from trainer.run.checkpoint import (
     LAST,
     Checkpoint,
@@ -51,6 +51,7 @@ def _parser() -> Parser:
             "v2v-train e2vid --videos webvid10k/ --workers 8 --out runs/e2vid",
             "v2v-train my.yaml --connect tcp://127.0.0.1:5555 --set optimizer.learning_rate=1e-4",
             "torchrun --nproc-per-node 4 -m trainer.train e2vid --connect tcp://head:5555",
+            "v2v-train data firenet-cpu",
             "v2v-train export --help",
         ],
         "Exit status: 0 trained to the end, 1 diverged, 2 wrong usage or input, full disk or no server, 128 + N ended "
@@ -230,10 +231,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit status. ``export`` in place of a configuration exports a network."""
+    """Run the command line; return the exit status. ``export`` and ``data`` are commands of their own."""
     given = sys.argv[1:] if argv is None else argv
-    if given[:1] == ["export"]:
-        return export.main(given[1:])
+    for word, other in (("export", export.main), ("data", data.main)):
+        if given[:1] == [word]:
+            return other(given[1:])
     return run_command(_parser(), run, argv, failures=(Diverged,), interrupted="interrupted before the first step")
 
 

@@ -148,6 +148,7 @@ class Batch(Drawn):
     frames            [B, T + lead_frames, 1, H, W] uint8, the simulated pixels
     frames_rgb        [B, T + lead_frames, 3, H, W] uint8, red, green and blue
     frames_u16        [B, T + lead_frames, 1, H, W] uint16, with the levels that the video stores
+    frames_blurred    [B, T + lead_frames, 1, H, W] uint8, the frames exposed for ``exposure_seconds`` of the recipe
     frames_all        [B, steps + 1, 1, H, W] uint8, all frames that were simulated, the first included
     flow              [B, T, 2, H, W] float16, (x, y) px; flow[:, t] belongs to voxel t of the target sequence, and is
                       zero before ``flow_from``

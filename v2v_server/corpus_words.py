@@ -21,6 +21,8 @@ from v2v_server.corpus.scenes.runs import Cleaning, Runs
 from v2v_server.corpus.scenes.scene import MOST_ANALYSED_FRAMES, NO_BARS, Sides
 from v2v_server.corpus.sources.listing import format_problems
 from v2v_server.corpus.videos import SplitVideos, VideoEntry
+from v2v_server.kinds.kind import LEAST_EXPOSED
+from v2v_server.kinds.registry import kind_of
 from v2v_server.lease_memory import MOST_CLIP_BYTES, MOST_LEASE_BYTES, frame_bytes, most_steps
 from v2v_server.simulation.draw import admits, smallest_scale
 from v2v_server.video.rows import Rows
@@ -94,6 +96,13 @@ def why_unsuited(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal:
     recipe = spec.recipe
     if recipe.is_timed and (refusal := _unsuited_rate(video, recipe)) is not None:
         return refusal
+    rate, least_hz = video.frames_per_second, kind_of(video.id).least_hz(spec)
+    if least_hz and not rate >= least_hz * (1.0 - 1e-6):
+        reason = (
+            f"{rate:g} frames/s, an exposure of {recipe.exposure_seconds[0]:g} s at frame_stride {recipe.frame_stride} "
+            f"needs {least_hz:.6g}: at least {LEAST_EXPOSED} frames are averaged"
+        )
+        return _unsuited(video, reason, "a longer exposure_seconds, none (0), or videos of a higher rate")
     if video.frames <= recipe.sequence_at(video.frames_per_second):
         return _too_short(video, recipe)
     return too_small(video, rows, recipe) or _too_large(video, rows, spec) or _all_cut(video, rows, spec)

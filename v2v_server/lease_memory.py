@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from v2v_protocol.spec import MOST_SUBSTEPS, StreamSpec
+from v2v_protocol.spec import StreamSpec
 from v2v_server.kinds.registry import kind_of
 from v2v_server.video.rows import Rows
 
@@ -42,12 +42,8 @@ def frame_bytes(video: VideoEntry, rows: Rows, spec: StreamSpec) -> tuple[int, i
     window, crop, depth = _sizes_of(video, rows, spec)
     read = window if recipe.resize_scale != (1.0, 1.0) else crop
     held = samples + (1 if spec.scene == "off" else samples)
-    seen = 2 * depth + np.dtype(spec.voxel_dtype).itemsize + _level_bytes(spec)
+    seen = 2 * depth + np.dtype(spec.voxel_dtype).itemsize + 2 * spec.levels_per_step
     return read * samples, depth * window * held + seen * crop
-
-
-def _level_bytes(spec: StreamSpec) -> int:
-    return 2 * (MOST_SUBSTEPS - 1) if spec.substep_px else 0
 
 
 def _sizes_of(video: VideoEntry, rows: Rows, spec: StreamSpec) -> tuple[int, int, int]:
@@ -75,7 +71,7 @@ def lease_bytes(video: VideoEntry, rows: Rows, spec: StreamSpec, array_bytes: in
     views = (recipe.resize_scale != (1.0, 1.0)) + (2 if recipe.contrast_probability else 1)
     clips = frames * depth * window * spec.samples_per_decode * (1 + is_copied)
     decoder = _DECODER_BYTES * video.width_px * video.height_px
-    simulation = frames * crop * (depth * views + _level_bytes(spec)) + array_bytes
+    simulation = frames * crop * (depth * views + 2 * spec.levels_per_step) + array_bytes
     return _IDLE_BYTES + clips + max(decoder, simulation) + array_bytes
 
 

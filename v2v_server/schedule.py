@@ -46,6 +46,7 @@ from v2v_server.corpus.scenes.scene import Sides
 from v2v_server.corpus.videos import SplitVideos, VideoEntry
 from v2v_server.corpus.videos import Videos as CatalogueVideos
 from v2v_server.corpus_words import longest_clip, too_small, why_unsuited
+from v2v_server.kinds.kind import VideosKind
 from v2v_server.kinds.registry import VIDEOS, kind_of
 from v2v_server.lease_memory import most_steps
 from v2v_server.video.rows import Rows
@@ -111,14 +112,16 @@ def _columns(videos: _Videos) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int
     return frames, sizes, SplitVideos.of(pieces) if len(pieces) == len(videos) else None
 
 
-def require_suitable(videos: _Videos, spec: StreamSpec) -> None:
-    """Check that samples of a spec can be made of such videos.
+def suitable_kind(videos: _Videos, spec: StreamSpec) -> VideosKind:
+    """Return the kind of these videos.
 
     Raises:
-        UsageError: they cannot.
+        UsageError: no sample of the spec can be made of it.
     """
-    if why := (kind_of(videos[0].id) if len(videos) else VIDEOS).refuses(spec):
+    kind = kind_of(videos[0].id) if len(videos) else VIDEOS
+    if why := kind.refuses(spec):
         raise UsageError(why)
+    return kind
 
 
 class SequenceTable:
@@ -144,7 +147,7 @@ class SequenceTable:
 
     def __init__(self, videos: _Videos, rows: Rows, spec: StreamSpec, columns: Columns | None = None) -> None:
         self._all, self._rows, self._spec, self._columns = videos, rows, spec, columns or Columns(videos)
-        require_suitable(videos, spec)
+        self._kind = suitable_kind(videos, spec)
         if spec.scene != "off" and self._columns.split is None:
             raise UsageError(
                 f'scene = "{spec.scene}" needs statistics of the videos, which this catalogue was opened without: '
@@ -221,6 +224,8 @@ class SequenceTable:
         strides = np.maximum(recipe.sequence_at(rates), 1)
         counts = np.clip((columns.frames[first:end] - 1) // strides, 0, spec.max_sequences_per_video)
         counts *= self._suits[size] & (recipe.reach_at(rates) <= self._most_steps[size] * recipe.frame_stride)
+        if least_hz := self._kind.least_hz(spec):
+            counts *= rates >= least_hz * (1.0 - 1e-6)
         if recipe.is_timed:
             steps = recipe.steps_at(rates)
             counts *= (steps > 0) & (steps <= MOST_STEPS_PER_GRID)

@@ -221,7 +221,13 @@ def _camera(
         notes.setdefault(note, []).append(title)
     sidecars = catalogue.sidecars
     labels = [name for name in LABELS if any(sidecars[each].fingerprints for each in sidecar_endings((name,)))]
-    arrays = ("voxels", "frames", *(("flow",) if with_flow else ()), *(catalogue.kind.shown_arrays or labels))
+    arrays = (
+        "voxels",
+        "frames",
+        *(["frames_blurred"] if any(stream.recipe.exposure_seconds) else ()),
+        *(("flow",) if with_flow else ()),
+        *(catalogue.kind.shown_arrays or labels),
+    )
     made = Remaker(catalogue, stream, arrays).made(wanted.seed, 0, 0)
     provenance = made.sample.provenance
     if note := _signal_note(catalogue, provenance, stream.recipe):

@@ -10,7 +10,7 @@ import numpy as np
 from v2v_protocol.errors import VideoError
 from v2v_protocol.messages import Lease
 from v2v_protocol.sample import Needs
-from v2v_protocol.spec import MOST_SUBSTEPS, StreamSpec
+from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.corpus.videos import VideoEntry
 from v2v_server.simulation.voxel import frame_times, step_seconds
@@ -75,7 +75,7 @@ class WholeClip:
         spec = self._clip.spec
         frame_bytes = self.size[0] * self.size[1] * (1 if spec.recipe.light == "sdr" else 2)
         most = max(1, _READ_BYTES // frame_bytes)
-        at_once = max(1, most // (2 * (MOST_SUBSTEPS - 1))) if spec.substep_px else most
+        at_once = max(1, most // (2 * spec.levels_per_step)) if spec.levels_per_step else most
         for first in range(0, self._steps, most):
             steps = min(most, self._steps - first)
             (decoded,) = decode_for(self._job(first, steps), (self._index,), source)

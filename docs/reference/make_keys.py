@@ -54,6 +54,7 @@ SOURCES = dict.fromkeys(
     "threshold_source": "V2V's ablation with fixed thresholds",
     "noise_scales_with_threshold": _CODE,
     "frame_stride": _OURS,
+    "exposure_seconds": _OURS,
     "max_boxes": _OURS,
     "grids_per_frame": _OURS,
     "voxel_seconds": _OURS,

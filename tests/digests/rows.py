@@ -119,6 +119,19 @@ PORTABLE: Mapping[str, Row] = {
     "scene": Row({}, ("voxels", "frames", "frames_rgb", "boxes"), AUTO | {"still_share": 0.5}, count=6),
     "keep_defects": Row({}, spec=AUTO | {"keep_defects": "bars,cuts,duplicates"}, count=6),
     "worlds": Row("worlds", ("voxels", "frames", *_TRUTH), count=6, kind="photographs"),
+    "exposure_seconds": Row({"exposure_seconds": (0.2, 0.4)}, ("voxels", "frames", "frames_blurred"), count=6),
+    "exposure_seconds of photographs": Row(
+        {"preset": "worlds-fine", "exposure_seconds": (0.005, 0.05), "world_speed_px": (200.0, 600.0)},
+        ("voxels", "frames_blurred", *_TRUTH),
+        count=6,
+        kind="photographs",
+    ),
+    "worlds-fine": Row(
+        {"preset": "worlds-fine", "contrast_probability": 0.5},
+        ("voxels", "frames_u16"),
+        count=6,
+        kind="photographs",
+    ),
     "worlds with sub-steps": Row(
         FINE
         | {

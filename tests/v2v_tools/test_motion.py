@@ -176,6 +176,7 @@ def test_the_start_makes_the_events_of_a_still_clip_and_none_if_it_is_zero(tmp_p
 QUIET = MeasuredMotion(
     changed=1000, lost=30, uncovered=120, paired=100, turned=7, speeds=(0,) * 4 + (600,) + (0,) * 252
 )
+TOLD = "tells the error without and with sub-steps, at twice this motion"
 FAST = QUIET._replace(speeds=(0,) * 12 + (500,) + (0,) * 7 + (100,) + (0,) * 236)
 SMALL = FAST._replace(lost=210)
 
@@ -185,7 +186,7 @@ SMALL = FAST._replace(lost=210)
     [
         (MeasuredMotion(), ("0 px", "0 px", "0%", "0%", "0%"), ""),
         (QUIET, ("1 px", "1 px", "7%", "12%", "3%"), ""),
-        (FAST, ("3 px", "5 px", "7%", "12%", "3%"), f"{motion.JUDGE} tells the error without and with sub-steps"),
+        (FAST, ("3 px", "5 px", "7%", "12%", "3%"), f"{motion.JUDGE} {TOLD}"),
         (SMALL, ("3 px", "5 px", "7%", "12%", "21%"), "something small or fast moves, or flickers, or is noise: "
          "sub-steps do not help"),
     ],

@@ -16,7 +16,7 @@ from v2v_server.broker.leases import clean_name
 from v2v_server.broker.session import Session
 from v2v_server.broker.state import Broker
 from v2v_server.lease_memory import MOST_CLIP_BYTES
-from v2v_server.schedule import Schedule, SequenceTable, require_suitable
+from v2v_server.schedule import Schedule, SequenceTable, suitable_kind
 
 MOST_BATCH_SIZE = 65_536
 MOST_CREDIT = 400
@@ -154,8 +154,9 @@ def _table(broker: Broker, spec: StreamSpec) -> SequenceTable:
         recipe.crop_width_px,
         recipe.resize_scale,
         recipe.light,
+        recipe.exposure_seconds,
         spec.flow_margin_px,
-        spec.substep_px > 0.0,
+        spec.levels_per_step,
         spec.voxel_dtype,
         spec.max_sequences_per_video,
         spec.scene,
@@ -163,8 +164,8 @@ def _table(broker: Broker, spec: StreamSpec) -> SequenceTable:
         spec.still_share,
         spec.quiet_share,
     )
+    suitable_kind(broker.facts.videos, spec)  # a table is also one of specs that such videos do not suit
     table = broker.tables.get(geometry)
-    require_suitable(broker.facts.videos, spec)
     if table is None:
         table = SequenceTable(broker.facts.videos, broker.facts.rows, spec, broker.columns)
         if not table.count:

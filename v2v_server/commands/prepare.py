@@ -24,6 +24,7 @@ from v2v_protocol.spec import SCENES
 from v2v_protocol.write_aside import JSON, write_json
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.corpus.sources.copies import is_url
 from v2v_server.corpus.sources.listing import LIST_SUFFIXES
 from v2v_server.kinds.registry import KindFlags, kind_from
 from v2v_server.prepare import Report, check_destination, prepare
@@ -47,7 +48,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         "Exit status: 1 if some videos were not prepared, or lack requested statistics.",
     )  # fmt: skip
     videos = parser.group("Videos")
-    videos.add_argument("source", metavar="SRC", help="folder of videos, a video, or a list file; never written to")
+    videos.add_argument(
+        "source",
+        metavar="SRC",
+        help="folder of videos, a video, a list file, or an address in object storage; never written to",
+    )
     videos.add_argument("destination", metavar="DST", help="folder to create, or to continue after an interruption")
     videos.add_argument(
         "--scene",
@@ -88,7 +93,8 @@ def _run(arguments: argparse.Namespace) -> int:
     source = Path(arguments.source).absolute()
     single = source.is_file() and source.suffix.lower() not in LIST_SUFFIXES
     folder = source.parent if source.is_file() else source
-    check_destination(Path(arguments.destination).resolve(), folder.resolve(), single)  # probing may take hours
+    root = None if is_url(arguments.source) else folder.resolve()
+    check_destination(Path(arguments.destination).resolve(), root, single)  # probing may take hours
     with Progress("probing videos") as probing:
         catalogue = open_catalogue(
             arguments.source,
@@ -108,7 +114,7 @@ def _run(arguments: argparse.Namespace) -> int:
             processes=arguments.workers,
             scene=arguments.scene != "off",
             planes=tuple(dict.fromkeys(arguments.planes)),
-            single=_is_video(Path(arguments.source), catalogue.folder),
+            single=root is not None and _is_video(Path(arguments.source), catalogue.folder),
             progress=lambda done, total, made, expected: shown(done, total, _size(made, expected)),
         )
     for line in summary(report, arguments.size, time.monotonic() - started):

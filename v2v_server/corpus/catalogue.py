@@ -10,8 +10,8 @@ import hashlib
 import os
 import sqlite3
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby
@@ -62,6 +62,7 @@ from v2v_server.corpus.videos import (
     IndexRow,
     Sidecars,
     Thresholds,
+    VideoEntry,
     Videos,
     VideoTable,
     joined,
@@ -332,10 +333,21 @@ class Catalogue:
         Raises:
             CorpusError: there is no such id in this catalogue, or no such folder on this host.
         """
-        self.source.expected = id, self.state(id) or ()
+        self._expect(id)
         self.folder  # noqa: B018 - raises where there is none
         with self.source.open_local(id, "") as path:
             return Path(os.fspath(path))
+
+    @contextmanager
+    def lend(self, video: VideoEntry) -> Iterator[Path]:
+        """Lend the file of a video, or its copy on this host, until the end of the context.
+
+        Raises:
+            VideoUnreadable, VideoChanged: see :meth:`VideoSource.open_local`.
+        """
+        self._expect(video.id)
+        with self.source.open_local(video.id, video.fingerprint) as path:
+            yield Path(os.fspath(path))
 
     def check(self, id: str, fingerprint: str, sidecar: str = "") -> None:
         """Check that the video is as catalogued, or its sidecar of that ending, see :meth:`VideoSource.verify`.
@@ -354,10 +366,15 @@ class Catalogue:
         Raises:
             VideoChanged, VideoUnreadable: they are not the catalogued ones, or cannot be told.
         """
-        known = self.state(id)
-        self.source.expected = id, known or ()
+        known = self._expect(id)
         if self.source.is_local and self.source.state(id) != known:
             raise VideoChanged(id, None, CHANGED)
+
+    def _expect(self, id: str) -> FileState | None:
+        """Tell the source in which state a video was catalogued, and return the state."""
+        state = self.state(id)
+        self.source.expected = id, unmarked(self.source, id, state) if state else ()
+        return state
 
     def state(self, id: str) -> FileState | None:
         """Return the state in which a video was catalogued; None if the index cannot tell.

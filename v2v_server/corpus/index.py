@@ -14,6 +14,7 @@ import re
 import shutil
 import sqlite3
 import time
+import weakref
 from collections.abc import Generator, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -131,6 +132,7 @@ class Store:
         self._database = sqlite3.connect(
             ":memory:" if path is None else path, timeout=_BUSY_SECONDS, isolation_level=None, check_same_thread=False
         )
+        weakref.finalize(self, self._database.close)  # commands that end with their catalogue open
         try:
             self._prepare()
         except BaseException:

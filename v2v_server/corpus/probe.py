@@ -170,10 +170,8 @@ def _culprit(source: VideoSource, id: str, death: Died) -> IndexRow:
         why = f"could not be probed: the process ended over it twice ({death.how}), which says nothing of the file"
         return IndexRow(id, -1, problem=f"{why}; the next start tries again")
     why = f"crashes the decoder: the process that probed it died ({death.how})"
-    try:
-        return IndexRow(id, *(source.members.get(id) or source.state(id)), problem=why)
-    except VideoUnreadable:
-        return IndexRow(id, -1, problem=why)  # gone meanwhile; if it comes back, it is probed again
+    size, modified, changed = source.states([id])  # none of a file that is gone: if it comes back, it is probed again
+    return IndexRow(id, size, modified, changed, problem=why)
 
 
 def batches(

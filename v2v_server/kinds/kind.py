@@ -32,6 +32,8 @@ RATE = (
     "as --marks states",
 )  # fmt: skip
 """What kinds of pictures without times of their own state of their flag ``rate``, in Hz."""
+LEAST_EXPOSED = 4
+"""Frames of a video that an exposure lasts at least."""
 _SUFFIX = re.compile(r"\.(?=.*[a-z]|26[45]$)[a-z0-9]+", re.IGNORECASE)
 
 
@@ -109,6 +111,10 @@ class VideosKind:
         """Return the id of the video that a file belongs to, by its relative path; "" if it belongs to none."""
         return path if path.lower().endswith(self.endings) else ""
 
+    def entry_of(self, path: str) -> str:
+        """Return the same; or the path, if the file is an archive whose members may be videos."""
+        return self.id_of(path) or (path if path.endswith(self.archive_endings) else "")
+
     def listed_id(self, path: PurePosixPath) -> str:
         """Return the id of the video that a list names by this path; "" if it cannot name one."""
         return str(path) if _SUFFIX.fullmatch(path.suffix) else ""
@@ -148,6 +154,11 @@ class VideosKind:
             if is_set and kind != self.name:
                 return f"the recipe's {fields} are for {kind}, these are {self.name}: add --videos-kind {kind}"
         return ""
+
+    def least_hz(self, spec: StreamSpec) -> float:
+        """Return the least rate of such videos whose samples can be made under a spec, frames a second; 0 for any."""
+        exposure, stride = spec.recipe.exposure_seconds, spec.recipe.frame_stride
+        return LEAST_EXPOSED * stride / exposure[0] if any(exposure) else 0.0
 
     def cannot(self) -> Mapping[str, str]:
         """Return the arrays that no such video gives, with what they need, and what to ask for instead."""

@@ -76,6 +76,10 @@ class PhotographKind(VideosKind):
             return super().refuses(spec)
         return "photographs stand still under this recipe: set world fields, as --preset worlds does"
 
+    def least_hz(self, spec: StreamSpec) -> float:
+        """Return 0: light is known at any time."""
+        return 0.0
+
     def cannot(self) -> Mapping[str, str]:
         """Return colour, and the labels of files."""
         labels = {name for name, form in ARRAYS.items() if form.needs.sidecars and name != "masks"}
@@ -85,7 +89,7 @@ class PhotographKind(VideosKind):
         }
 
     def reads(self, spec: StreamSpec, height_px: int, width_px: int) -> tuple[int, int]:
-        """Return the crop, which is rendered in 12 bits."""
+        """Return the crop, whose levels take two bytes."""
         return spec.recipe.crop_height_px * spec.recipe.crop_width_px, 2
 
     def variants(self, found: frozenset[Variant]) -> frozenset[Variant]:

@@ -20,7 +20,7 @@ from v2v_server.store.picture_sequence import errors_of_pictures
 from v2v_server.video.decode import BIT_EXACT_CODECS, ClipRequest, Cut, DecodedClip, DecodedFrame, DecodedPicture
 from v2v_server.video.fingerprint import check_content, check_fingerprint
 from v2v_server.video.frame_index import LARGEST_INDEXED_SIDE_PX, FrameIndex, unseekable
-from v2v_server.video.picture import SDR, LumaFormat, PixelRect, Signal, luma_plane
+from v2v_server.video.picture import MOST_BITS, SDR, LumaFormat, PixelRect, Signal, luma_plane
 from v2v_server.video.picture_file import (
     LARGEST_PICTURE_FILE_BYTES,
     check_picture,
@@ -46,7 +46,7 @@ class _Still(NamedTuple):
 
     Attributes:
         grey: [H, W] uint8, its usable rows.
-        pyramid: the same in 12 bits, from fine to coarse.
+        pyramid: the same in the bits that a world is rendered in, from fine to coarse.
         codec: FFmpeg's name of the format.
     """
 
@@ -78,7 +78,7 @@ class Photograph:
         check_fingerprint(self._path, fingerprint)
 
     def clips(self, request: ClipRequest) -> tuple[DecodedClip, ...]:
-        """Render the view of each sample, in 12 bits; without views, return the photograph as it stands, in 8 bits."""
+        """Render the view of each sample; without views, return the photograph as it stands, in 8 bits."""
         request.check()
         if not request.views:
             return tuple(self._still(request, cut) for cut in request.cuts)
@@ -114,14 +114,14 @@ class Photograph:
             VideoChanged: it is not the one that was checked.
             VideoError: it is damaged or differs from the index.
         """
-        index = request.index
+        index, bits = request.index, request.views[0].spec.recipe.world_bits if request.views else MOST_BITS
         with errors_of_pictures(self._path, lambda: (None, "")):
             status = os.stat(self._path)
-            key = self._path, status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino, request.rows
+            key = self._path, status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino, request.rows, bits
             if key not in kept_photographs:
                 data = self._read()
                 check_content(self._path, xxhash.xxh3_128(data).hexdigest(), self._fingerprint)
-                kept_photographs[key] = _decoded(data, index, request.usable)
+                kept_photographs[key] = _decoded(data, index, request.usable, bits)
             found = kept_photographs[key] = kept_photographs.pop(key)  # the latest is the last one
             while (
                 len(kept_photographs) > 1
@@ -131,8 +131,8 @@ class Photograph:
         return found
 
 
-def _decoded(data: bytes, index: FrameIndex, usable: PixelRect) -> _Still:
-    """Decode the usable rows of a photograph.
+def _decoded(data: bytes, index: FrameIndex, usable: PixelRect, bits: int) -> _Still:
+    """Decode the usable rows of a photograph; its pyramid has ``bits``.
 
     Raises:
         ValueError: it has another size than the index.
@@ -146,7 +146,7 @@ def _decoded(data: bytes, index: FrameIndex, usable: PixelRect) -> _Still:
         raise ValueError(f"has {found[1]}x{found[0]} px, and {size[1]}x{size[0]} px by its head")
     signal = SDR if luma.bits == SDR.bits else Signal(16)
     levels = DecodedFrame(frame, luma_plane(frame, luma), luma, lies, *size, signal, codec).part(usable, signal)
-    return _Still(eight_bits(levels, signal), pyramid_of(levels), codec)
+    return _Still(eight_bits(levels, signal), pyramid_of(levels, bits), codec)
 
 
 def _facts(data: bytes) -> VideoFacts:

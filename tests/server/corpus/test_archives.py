@@ -23,7 +23,9 @@ from PIL import Image
 from tests.clips import panned_luma, truncated, write_clip
 from tests.digests.rows import Row, samples_of
 from tests.packed import pack, packed_forms
+from v2v_protocol.command import FAILED
 from v2v_protocol.errors import CorpusError, VideoChanged, VideoGone, VideoUnreadable
+from v2v_server.commands.prepare import main
 from v2v_server.corpus import members
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.sources import archives
@@ -439,11 +441,15 @@ def test_no_change_of_bytes_ends_the_reading_of_an_archive_otherwise(data: st.Da
 
 
 def test_a_store_is_prepared_from_archives_as_from_a_folder(forms: Mapping[str, Path], tmp_path: Path) -> None:
+    """Also in object storage, also on a host without the copies; and again by the command line."""
+    pytest.importorskip("fsspec", reason="the extra 'cloud' is not installed")
     made = {}
-    for form, folder in forms.items():
-        out = tmp_path / "out" / form / "store"
-        with opened(folder, tmp_path) as catalogue:
-            report = prepare(catalogue, out, processes=int(form == "tar"))
+    for form, folder in {**forms, "remote": Path(f"file:{forms['tar']}")}.items():
+        out, source = tmp_path / "out" / form / "store", str(folder).replace("file:", "file://")
+        with opened(source, tmp_path) as catalogue:
+            for copy in (tmp_path / "copies").glob("??/*"):
+                copy.unlink()
+            report = prepare(catalogue, out, processes=int(form in ("tar", "remote")))
             assert len(report.failed) == 0
             assert prepare(catalogue, out, processes=0).kept == len(catalogue.videos)
         files = {
@@ -454,4 +460,5 @@ def test_a_store_is_prepared_from_archives_as_from_a_folder(forms: Mapping[str, 
         (manifest,) = [name for name in files if name.name == MANIFEST_NAME]
         lines = files.pop(manifest).splitlines()
         made[form] = files, sorted(lines[1:])
-    assert made["folder"] == made["tar"] == made["zip"]
+    assert made["folder"] == made["tar"] == made["zip"] == made["remote"]
+    assert main([source, str(out), "--cache-dir", str(tmp_path)]) == FAILED, "one file of the corpus is no video"

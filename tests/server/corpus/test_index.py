@@ -290,7 +290,7 @@ def test_videos_are_the_usable_ones_and_have_the_digest_of_all_that_shapes_sampl
     assert [videos.find(NAMES[at]) for at in used] == list(range(len(used)))
     assert videos.find("none") is None
     assert videos[-1] == videos[len(used) - 1]
-    assert videos[:2] == (videos[0], videos[1])
+    assert repr(videos[:2]) == repr((videos[0], videos[1]))  # an unknown rate is NaN, which equals nothing
     with pytest.raises(IndexError):
         videos[len(used)]
     assert [video.pieces for video in videos] == each

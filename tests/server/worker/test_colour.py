@@ -265,7 +265,7 @@ def test_deep_clips_offline(tmp_path: Path) -> None:
         )  # fmt: skip
         (view,) = seen(Leases(tmp_path / "clips", [lease]), 0)
     assert whole.voxels.any()
-    voxels = simulated(view, sample.provenance.params)
+    voxels = simulated(view, sample.provenance.params).voxels
     np.testing.assert_array_equal(voxels, sample.arrays["voxels"])
 
 

@@ -1,34 +1,35 @@
 """Archives whose members are videos where they lie: tar files, and zip files without compression.
 
 The id of a member is the archive's path without its ending, a slash, and the member's name: that of the file in the
-folder that the archive unpacks to. The state of a member is its size, its first byte in the archive, and a number that
-changes with the archive. So a job or lease, which has the state of its video, says where to read it, and only the
-process that makes the table of an archive parses one.
+folder that the archive unpacks to. The state of a member says where it lies (:class:`MemberPlace` of ``source``). So a
+job or lease, which has the state of its video, says where to read it, and only the process that makes the table of an
+archive parses one.
 """
 
 from __future__ import annotations
 
 import errno
-import hashlib
 import io
 import os
 import re
 import stat
+import struct
 import tarfile
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from importlib.resources.abc import Traversable
 from types import SimpleNamespace
-from typing import IO, Any, BinaryIO, Protocol
-from zipfile import ZIP_STORED, BadZipFile, ZipFile, ZipInfo
+from typing import IO, Any, Protocol, Self
+from zipfile import ZIP_DEFLATED, ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 
 import msgpack
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.programs import printable
-from v2v_server.corpus.sources.source import UNPRINTABLE
+from v2v_server.corpus.sources.source import UNPRINTABLE, FileState
 from v2v_server.video.file_range import FileRange, open_bytes
 
 MOST_MEMBERS = 1 << 20
@@ -37,22 +38,30 @@ MOST_CHARACTERS = 1024
 _LARGEST_TABLE_BYTES = 48 << 20
 _LEAVES = re.compile(r"(?:^|[/\n])\.{0,2}(?:[/\n]|$)")
 """A name that is absolute, leads out of its folder, or has an empty part; in one text or in lines."""
-_ZIP_HEAD_BYTES, _ZIP_HEAD = 30, b"PK\3\4"
+ZIP_HEAD_BYTES, _ZIP_HEAD = 30, b"PK\3\4"
+DEFLATE_RATIO = 1032
+"""Largest number of bytes that a byte of a deflated member may stand for."""
+MOST_ZIP_HEAD_BYTES = ZIP_HEAD_BYTES + 2 * 65535
+"""Largest header of a member of a zip file: name and extra fields follow the first bytes."""
+ZIP_END_BYTES, MOST_DIRECTORY_BYTES = 1 << 17, 256 << 20
+"""Of a remote zip file: what is fetched of its end at first, and the limit of what is fetched for its directory."""
 _BLOCK_BYTES = 1 << 20
-_END_MARK = bytes(tarfile.BLOCKSIZE)
 LEAVES = "has a name that leads out of the archive, or an empty part: rename it"
+CHANGES_WHILE_READ = "changes while it is read; start again"
 CUT = "is cut short, or damaged: fetch it again"
 
 
 class HasArchives(Protocol):
     """A source that lists archives."""
 
-    def read_table(self, archive: str) -> bytes:
-        """Return the encoded :class:`ArchiveTable` of an archive. Called in confined processes.
+    def lend_archive(self, archive: str, state: FileState) -> AbstractContextManager[str]:
+        """Lend the path of what :func:`read_table` needs of an archive. A confined process opens it.
+
+        Args:
+            state: as listed. At the end of the context it is checked.
 
         Raises:
-            ValueError: it is damaged, or of no form that is read.
-            VideoUnreadable, OSError: it cannot be read.
+            VideoUnreadable, VideoChanged, OSError: the archive cannot be read, or is another one by now.
         """
 
 
@@ -119,15 +128,14 @@ class ArchiveTable:
         return cls(names, found, tuple(zip(refused, reasons, strict=True)), notes)
 
 
-def archive_mark(path: str, state: Sequence[int]) -> int:
-    """Return 62 bits that change with an archive: by its ending and its state."""
-    text = repr((path.rpartition(".")[2], *state))
-    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8]) >> 2
-
-
 def member_id(archive: str, name: str) -> str:
     """Return the id of a member."""
     return f"{archive.rpartition('.')[0]}/{name}"
+
+
+def name_in(archive: str, id: str) -> str:
+    """Return the name in its archive of a member of that id."""
+    return id[len(archive.rpartition(".")[0]) + 1 :].rstrip("/")
 
 
 def find_archive(
@@ -141,21 +149,32 @@ def find_archive(
     return ""
 
 
-def read_table(file: BinaryIO, path: str, is_video: Callable[[str], object]) -> ArchiveTable:
+def same_ids(archive: str, endings: Sequence[str], is_there: Callable[[str], bool]) -> str:
+    """Return why an archive is refused: beside it lies a folder or archive that gives the same ids. "" if none does."""
+    stem, dot, ending = archive.rpartition(".")
+    others = (stem + other for other in ("", *endings) if dot + ending in endings and other != dot + ending)
+    found = next(filter(is_there, others), "").rpartition("/")[2]
+    return found and f"would give the same ids as {found} beside it: move one of them away"
+
+
+def read_table(file: IO[bytes], path: str, is_video: Callable[[str], object], is_remote: bool = False) -> ArchiveTable:
     """Read the table of an archive.
 
     Args:
-        file: the archive; seekable.
+        file: the archive.
         path: its path, whose ending tells its form.
         is_video: returns whether a member of a name may be a video: only these are refused one by one.
+        is_remote: whether ``file`` is what :meth:`HasArchives.lend_archive` gives of an archive that lies elsewhere: a
+            tar file as a stream, a zip file that has its directory only.
 
     Raises:
         ValueError: it is damaged, not of this form, or beyond the limits.
         OSError: it cannot be read.
     """
     found, refused, notes = dict[str, tuple[int, int]](), dict[str, str](), []
+    read = _zip_members if path.endswith(".zip") else _tar_members
     try:
-        for name, start, size, problem in (_zip_members if path.endswith(".zip") else tar_members)(file):
+        for name, start, size, problem in read(file, is_remote):
             if len(name) > MOST_CHARACTERS:
                 raise ValueError(f"has a name of {len(name)} characters; the limit is {MOST_CHARACTERS}")
             problem = problem or (UNPRINTABLE if printable(name) != name else "")
@@ -181,18 +200,29 @@ def read_table(file: BinaryIO, path: str, is_video: Callable[[str], object]) -> 
     return ArchiveTable(names, places, tuple(refused.items()), tuple(notes))
 
 
-def tar_members(file: IO[bytes], mode: str = "r:") -> Iterator[tuple[str, int, int, str]]:
-    """Yield the members of a tar file that are no folders: name, first byte, size, and why one cannot be read or "".
+class _Header(tarfile.TarInfo):
+    """A header of a tar file, which :mod:`tarfile` takes for the end of the archive where it is damaged or missing."""
 
-    Args:
-        mode: of :func:`tarfile.open`; ``r|`` reads a stream.
+    @classmethod
+    def frombuf(cls, buf: bytes | bytearray, encoding: str, errors: str) -> Self:
+        try:
+            return super().frombuf(buf, encoding, errors)
+        except tarfile.EOFHeaderError:  # type: ignore[attr-defined]
+            raise
+        except tarfile.HeaderError as error:
+            raise ValueError(f"{CUT}: where a member or the end mark has to be, there is neither ({error})") from error
+
+
+def _tar_members(file: IO[bytes], is_remote: bool) -> Iterator[tuple[str, int, int, str]]:
+    """Yield the members of a tar file that are no folders: name, first byte, size, and why one cannot be read or "".
 
     Raises:
         ValueError, tarfile.TarError: it is damaged, or has bytes behind its end mark.
     """
-    with tarfile.open(fileobj=file, mode=mode) as tar:  # type: ignore[call-overload]
+    mode: Any = "r|" if is_remote else "r:"
+    with tarfile.open(fileobj=file, mode=mode, bufsize=_BLOCK_BYTES, tarinfo=_Header) as tar:
         while (member := tar.next()) is not None:
-            tar.members.clear()  # of a million members each would take 1 kB
+            tar.members.clear()  # type: ignore[attr-defined]  # of a million members each would take 1 kB
             if member.isdir():
                 continue
             problem = "is sparse: unpack the archive and pack it without --sparse" if member.issparse() else ""
@@ -200,42 +230,66 @@ def tar_members(file: IO[bytes], mode: str = "r:") -> Iterator[tuple[str, int, i
                 problem = "is a link, or no regular file: unpack the archive"
             name = re.sub(r"^(?:\./+)+", "", member.name)
             yield name, member.offset_data, member.size, problem
-        reader = tar.fileobj
-        if mode == "r:":
-            reader.seek(tar.offset)
-            at, rest = tar.offset, reader.read(tarfile.BLOCKSIZE)
-            if rest != _END_MARK:
-                raise ValueError(f"{CUT}: at byte {at} there is neither a member nor the end mark")
-            while rest := reader.read(_BLOCK_BYTES):
-                if rest.strip(b"\0"):
-                    raise ValueError(
-                        "has bytes behind its end mark: if archives were joined, join them with tar --concatenate, or "
-                        "keep each as a file"
-                    )
+        while rest := tar.fileobj.read(_BLOCK_BYTES):
+            if rest.strip(b"\0"):
+                raise ValueError(
+                    "has bytes behind its end mark: if archives were joined, join them with tar --concatenate, or "
+                    "keep each as a file"
+                )
 
 
-def _zip_members(file: IO[bytes]) -> Iterator[tuple[str, int, int, str]]:
+def _zip_members(file: IO[bytes], is_remote: bool) -> Iterator[tuple[str, int, int, str]]:
+    """Yield the members of a zip file, see :func:`_tar_members`. Where only its directory is there, a member's first
+    byte is that of its header.
+    """
     end = file.seek(0, os.SEEK_END)
     with ZipFile(file) as packed:
         for entry in packed.infolist():
             if entry.is_dir():
                 continue
-            start, problem = 0, _packed(entry)
+            start, problem = entry.header_offset, _packed(entry, is_remote)
             if not problem:
-                file.seek(entry.header_offset)
-                head = file.read(_ZIP_HEAD_BYTES)
-                lengths = int.from_bytes(head[26:28], "little") + int.from_bytes(head[28:30], "little")
-                start = entry.header_offset + _ZIP_HEAD_BYTES + lengths
-                if not head.startswith(_ZIP_HEAD) or start + entry.file_size > end:
+                file.seek(start)
+                start += 0 if is_remote else ZIP_HEAD_BYTES + zip_head_rest(file.read(ZIP_HEAD_BYTES), end)
+                if start + entry.compress_size > end:
                     problem = "lies beyond the end of the archive, or its header is damaged: fetch it again"
             yield entry.filename, start, entry.file_size, problem
 
 
-def _packed(entry: ZipInfo) -> str:
+def zip_head_rest(head: bytes, otherwise: int) -> int:
+    """Return how many bytes lie between the first ones of a member's header and the member.
+
+    Args:
+        head: the first :data:`ZIP_HEAD_BYTES`.
+        otherwise: what is returned if it is no header.
+    """
+    return sum(struct.unpack("<HH", head[26:])) if head.startswith(_ZIP_HEAD) and len(head) == 30 else otherwise
+
+
+def is_deflated(head: bytes) -> bool:
+    """Return whether a member of a zip file is deflated, by the first bytes of its header."""
+    return int.from_bytes(head[8:10], "little") == ZIP_DEFLATED
+
+
+def directory_bytes(end: bytes) -> int:
+    """Return how many of the last bytes of a zip file hold its directory, by the last :data:`ZIP_END_BYTES`."""
+    at = end.rfind(b"PK\5\6")
+    length = int.from_bytes(end[at + 12 : at + 16], "little")
+    if length == 0xFFFFFFFF:
+        long = end.rfind(b"PK\6\6")
+        length = int.from_bytes(end[long + 40 : long + 48], "little")
+    return len(end) - at + length + 1024 if at >= 0 else 0  # what lies behind the directory has less
+
+
+def _packed(entry: ZipInfo, is_remote: bool) -> str:
     if entry.flag_bits & 1:
         return "is encrypted: unpack the archive"
-    if entry.compress_type != ZIP_STORED or entry.compress_size != entry.file_size:
-        return "is compressed, and cannot be read in place: unpack the archive, or pack it with zip -0"
+    is_stored = entry.compress_type == ZIP_STORED and entry.compress_size == entry.file_size
+    if not is_stored and not (is_remote and entry.compress_type == ZIP_DEFLATED):
+        return (
+            "is compressed, and cannot be read in place: unpack the archive, pack it with zip -0, or name its folder "
+            "as file:///PATH, to have deflated videos copied first"
+        )
     return "is a link: unpack the archive" if stat.S_ISLNK(entry.external_attr >> 16) else ""
 
 

@@ -7,21 +7,26 @@ which may pass.
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import os
 import posixpath
 import random
 import re
 import time
+import zlib
 from array import array
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from functools import cached_property
 from importlib import import_module
+from io import BytesIO
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 from zipfile import Path as ZipPath
 from zipfile import ZipFile
@@ -32,12 +37,27 @@ from v2v_protocol.errors import (
     UsageError,
     VideoChanged,
     VideoDenied,
+    VideoError,
     VideoGone,
     VideoUnreadable,
 )
 from v2v_protocol.programs import install_line, printable
+from v2v_server.corpus.sources.archives import (
+    MOST_DIRECTORY_BYTES,
+    MOST_ZIP_HEAD_BYTES,
+    ZIP_END_BYTES,
+    ZIP_HEAD_BYTES,
+    MemberPath,
+    directory_bytes,
+    find_archive,
+    is_deflated,
+    name_in,
+    same_ids,
+    zip_head_rest,
+)
 from v2v_server.corpus.sources.copy_folder import CopyFolder
 from v2v_server.corpus.sources.listing import ListEntry, answers, count_left_out
+from v2v_server.corpus.sources.object_parts import PART_BYTES, ReadBytes, copy_bytes, inflate, open_part
 from v2v_server.corpus.sources.sidecars import is_sidecar, sidecar_fingerprint, state_of_parts, state_text
 from v2v_server.corpus.sources.source import (
     GONE,
@@ -45,10 +65,12 @@ from v2v_server.corpus.sources.source import (
     NO_STATE,
     UNPRINTABLE,
     FileState,
+    MemberPlace,
     SourceOptions,
     VideoSource,
     is_expected,
     mark_of,
+    unmarked,
 )
 from v2v_server.kinds.registry import KINDS, kind_of
 from v2v_server.store.quota import MOST_GIB
@@ -164,13 +186,16 @@ class Bucket:
             raise VideoGone(below, None, f"is not in {self.url} any more")
         return states
 
-    def state(self, id: str, tries: int = TRIES) -> FileState:
+    def state(self, id: str, tries: int = TRIES, member: str = "") -> FileState:
         """Ask for the state of one object: its size, and 63 bits that stand for its ETag or the store's equivalent.
+
+        Args:
+            member: of the object, if it is an archive: what errors name.
 
         Raises:
             VideoGone, VideoDenied, VideoUnreadable: the store does not deliver it.
         """
-        return self._ask(id, lambda: _state(self._store.info(self._path(id))), tries)
+        return self._ask(member or id, lambda: _state(self._store.info(self._path(id))), tries)
 
     def fetch(self, id: str, to: Path) -> None:
         """Write an object to a file.
@@ -179,6 +204,42 @@ class Bucket:
             VideoGone, VideoDenied, VideoUnreadable: the store does not deliver it.
         """
         self._ask(id, lambda: self._store.get_file(self._path(id), str(to)))
+
+    def read(
+        self,
+        id: str,
+        part: tuple[int, int],
+        is_same: Callable[[FileState], bool],
+        use: Callable[[ReadBytes], T],
+        tries: int = TRIES,
+        member: str = "",
+    ) -> T:
+        """Pass a part of an object on, and return what is made of it. All bytes are of the same state.
+
+        Args:
+            part: its first byte, and the byte behind the last; that is 0 for the end of the object.
+            is_same: returns whether a state is the catalogued one.
+            use: reads the bytes. It is called once more if a try fails.
+            member: see :meth:`state`.
+
+        Raises:
+            VideoGone, VideoDenied, VideoUnreadable: the store does not deliver it.
+            VideoChanged: it is another object by now.
+        """
+
+        def check(state: FileState) -> None:
+            if not is_same(state):
+                raise VideoChanged(member or id, None, f"changed in {self.url} since it was catalogued: {id} differs")
+
+        def question() -> T:
+            with open_part(self._store, self._path(id), *part) as (read, told):
+                check(self.state(id, tries, member) if told is None else _state(told))
+                used = use(read)
+                if told is None:
+                    check(self.state(id, tries, member))
+                return used
+
+        return self._ask(member or id, question, tries)
 
     def _path(self, id: str) -> str:
         if PurePosixPath(id).is_absolute() or ".." in PurePosixPath(id).parts:
@@ -191,7 +252,7 @@ class Bucket:
         for left in reversed(range(tries)):
             try:
                 return question()
-            except ProtocolError:
+            except (ProtocolError, VideoError):
                 raise
             except Exception as error:
                 # fsspec reports any failure over HTTP as a missing file; its cause is an answer's status or an OSError.
@@ -212,7 +273,7 @@ class Bucket:
         raise AssertionError
 
 
-def _state(info: dict[str, Any]) -> FileState:
+def _state(info: Mapping[str, Any]) -> FileState:
     mark, size = next((str(info[key]) for key in _MARKS if info.get(key) is not None), ""), info.get("size")
     if size is None:  # answered in chunks: without a mark either, nothing tells a change
         size = 0 if mark else NO_STATE[0]
@@ -268,24 +329,36 @@ class Copies(VideoSource):
             if name.rpartition("/")[2] == MANIFEST_NAME:
                 raise CorpusError(f"{self}: {name} makes it a prepared corpus: copy that to a disk")
         if (listed := self.listed()) is not None:
-            yield from (entry.id for entry in listed)
+            yield from (
+                entry.id if entry.id in self._objects else self.archive_of(entry.id) or entry.id for entry in listed
+            )
             return
         for name in self._objects:
             parts = name.split("/")
             if any(part.startswith(".") for part in parts):
                 continue
-            if not (id := self.kind.id_of(name)) and self.kind.id_of(name.partition("?")[0]):
+            if not (id := self.kind.entry_of(name)) and self.kind.entry_of(name.partition("?")[0]):
                 refused[printable(name)] = "is a link with a query, which is not followed: link to the file itself"
-            elif name.endswith(self.kind.archive_endings):
-                left_out["archives in object storage are not read: copy them to a disk of this host"] += 1
             elif not id:
                 count_left_out(parts[-1], left_out)
             elif printable(name) != name:
                 refused[printable(name)] = UNPRINTABLE
             elif "" in parts or id == "/":
                 refused[name] = "has an empty part between two slashes, or is a picture outside of a folder"
+            elif why := same_ids(name, self.kind.archive_endings, self._is_there):
+                refused[name] = why
             else:
                 yield id
+
+    def archive_of(self, id: str) -> str:
+        """Return the listed archive that the id of a member leads into; "" if it leads into none."""
+        return find_archive(id, self.kind.archive_endings, self._is_folder, self._objects.__contains__)
+
+    def _is_folder(self, path: str) -> bool:
+        return next(self._below(f"{path}/"), None) is not None
+
+    def _is_there(self, path: str) -> bool:
+        return path in self._objects or self._is_folder(path)
 
     def states(self, ids: Sequence[str]) -> array[int]:
         """Return the states of many objects, from the listing."""
@@ -300,6 +373,8 @@ class Copies(VideoSource):
         Raises:
             VideoUnreadable: the store does not answer, or has no such object.
         """
+        if member := self._member(id):  # what delivers its bytes checks the archive
+            return unmarked(self, id, member.state)
         if id.endswith("/"):
             return state_of_parts(self, id, self._parts(id, listed, tries))
         size, content, _ = self.bucket.state(id, tries) if listed is None else listed.get(id, GONE)
@@ -332,6 +407,10 @@ class Copies(VideoSource):
             if is_sidecar(id):
                 found = self.bucket.find(id, tries=1) if id.endswith("/") else {"": self.bucket.state(id, tries=1)}
                 changed = state_text(sorted(found.items())) != state and state is not None
+            elif member := self._member(id, unmarked(self, id, state) if isinstance(state, tuple) else ()):
+                changed = not member.is_in(self.bucket.state(member.archive, tries=1, member=id))
+            elif state is None and self.archive_of(id):
+                return  # in which state it was is not known
             else:
                 changed = self.state(id, tries=1) != state and state is not None
         except VideoGone:
@@ -346,6 +425,10 @@ class Copies(VideoSource):
     def sidecar_state(self, id: str) -> str | OSError:
         """Return a text that stands for the listed objects' states, see :meth:`VideoSource.sidecar_state`."""
         try:
+            if self.tables and (table := self.tables.get(archive := self.archive_of(id))):
+                member = MemberPath(archive, 0, name_in(archive, id), table)  # type: ignore[abstract]
+                if member.is_dir() if id.endswith("/") else member.is_file():
+                    raise OSError(errno.ENOTSUP, "lies in an archive of object storage, where none is read: unpack it")
             return state_text((name[len(id) :], self._objects[name]) for name in self._below(id))
         except OSError as error:
             return error
@@ -378,7 +461,9 @@ class Copies(VideoSource):
             VideoChanged: it is another one by now.
         """
         expected = is_expected(self, id)
-        if id.endswith("/"):
+        if member := self._member(id):
+            self._write_member(id, member, slot)
+        elif id.endswith("/"):
             self._pack(id, slot)
         else:
             self.bucket.fetch(id, slot)
@@ -390,6 +475,98 @@ class Copies(VideoSource):
         if id == self.expected[0] and not (expected and is_expected(self, id)):
             self._check_content(id, slot, fingerprint)
         return found
+
+    def _write_member(self, id: str, member: MemberPlace, slot: Path) -> None:
+        """Fetch a member of an archive with one question.
+
+        Raises:
+            VideoError: see :meth:`Bucket.read`; or it is damaged in the archive.
+            VideoUnreadable: it is larger than all copies may be. Few deflated bytes can stand for a full disk.
+        """
+        if member.size > self.copies.most_bytes:
+            raise VideoUnreadable(id, None, f"its {member.size} bytes exceed the limit of copies: raise --copies-gib")
+        is_zip = member.archive.endswith(".zip")
+
+        def use(read: ReadBytes) -> None:
+            with slot.open("wb") as file:
+                if is_zip:
+                    copy_bytes(read, head := BytesIO(), ZIP_HEAD_BYTES)
+                    if (rest := zip_head_rest(head.getvalue(), -1)) < 0:
+                        raise VideoError(
+                            id, None, f"its header in {member.archive} is damaged: upload the archive again"
+                        )
+                    copy_bytes(read, BytesIO(), rest)
+                if is_zip and is_deflated(head.getvalue()):
+                    try:
+                        inflate(read, file, member.size)
+                    except (zlib.error, ValueError) as error:
+                        raise VideoError(
+                            id, None, f"cannot be inflated ({error}): upload {member.archive} again"
+                        ) from error
+                else:
+                    copy_bytes(read, file, member.size)
+
+        # One byte at least: there is no range of none. Deflated bytes may be a few more than those that they stand for.
+        more = MOST_ZIP_HEAD_BYTES + member.size // 1000 if is_zip else 0
+        part = member.start, member.start + more + max(member.size, 1)
+        self.bucket.read(member.archive, part, member.is_in, use, member=id)
+
+    @contextlib.contextmanager
+    def lend_archive(self, archive: str, state: FileState) -> Iterator[str]:
+        """Lend a pipe with the bytes of a tar file, or a file that has the directory of a zip file in its place, and
+        nothing else of it; see :meth:`HasArchives.lend_archive`.
+        """
+        if state[0] <= 0:
+            raise VideoUnreadable(archive, None, "is empty, or its store does not say how large it is")
+        with TemporaryDirectory(prefix="v2v-archive-") as folder:
+            path = Path(folder, "archive")
+            if archive.endswith(".zip"):
+                self._write_directory(archive, state, path)
+                yield str(path)
+                return
+            os.mkfifo(path)
+            ours = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # without a reader, a writer could not open it
+            with ThreadPoolExecutor(1) as thread:
+                fed = thread.submit(self._feed, archive, state, os.open(path, os.O_WRONLY))
+                try:
+                    yield str(path)
+                finally:
+                    os.close(ours)  # of a process that did not read to the end: then writing ends, too
+                fed.result()
+
+    def _feed(self, archive: str, state: FileState, pipe: int) -> None:
+        def use(read: ReadBytes) -> None:
+            with contextlib.suppress(BrokenPipeError):
+                while block := read(PART_BYTES):
+                    to.write(block)
+
+        with open(pipe, "wb", buffering=0) as to:
+            self.bucket.read(archive, (0, 0), state.__eq__, use, tries=1)  # the pipe has what was written to it
+
+    def _write_directory(self, archive: str, state: FileState, path: Path) -> None:
+        """Write the end of a zip file with its directory, and nothing in front of it.
+
+        Raises:
+            VideoError: see :meth:`Bucket.read`; or the directory is too large.
+        """
+
+        def last(count: int) -> bytes:
+            count = min(count, state[0])
+
+            def use(read: ReadBytes) -> bytes:
+                copy_bytes(read, end := BytesIO(), count)
+                return end.getvalue()
+
+            return self.bucket.read(archive, (state[0] - count, state[0]), state.__eq__, use)
+
+        end = last(ZIP_END_BYTES)
+        if (needed := directory_bytes(end)) > MOST_DIRECTORY_BYTES:
+            why = f"has a directory of {needed} bytes; the limit is {MOST_DIRECTORY_BYTES}: split it"
+            raise VideoUnreadable(archive, None, why)
+        end = last(needed) if needed > len(end) else end
+        with path.open("wb") as file:
+            file.seek(state[0] - len(end))
+            file.write(end)
 
     def _pack(self, id: str, slot: Path) -> None:
         """Fetch a folder into one file, a ZIP archive without compression."""
@@ -441,6 +618,6 @@ def open_source(name: str, options: SourceOptions) -> Copies | None:
         raise UsageError(f"--copies-gib {options.copies_gib:g}: give more than 0, at most {MOST_GIB:g}")
     folder = Path(options.copies or cache_folder(options.cache_dir) / "copies").absolute()
     bucket, listed, (above, _, file) = Bucket(name), options.listed, name.rpartition("/")
-    if options.list_file is None and any(kind.id_of(file) == file != "" for kind in KINDS.values()):
+    if options.list_file is None and any(kind.entry_of(file) == file != "" for kind in KINDS.values()):
         bucket, listed = Bucket(above, file), lambda: (ListEntry(file),)
     return Copies(bucket, folder, int(options.copies_gib * (1 << 30)), listed)

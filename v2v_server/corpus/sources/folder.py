@@ -8,16 +8,25 @@ import stat
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
+from dataclasses import replace
 from functools import lru_cache, partial
 from itertools import chain
 from operator import attrgetter
 from pathlib import Path, PurePosixPath
 from typing import cast
 
-from v2v_protocol.errors import CorpusError, VideoChanged, VideoError
+from v2v_protocol.errors import CorpusError, VideoChanged, VideoError, VideoUnreadable
 from v2v_protocol.programs import printable
 from v2v_protocol.write_aside import OUTPUT_MARKER
-from v2v_server.corpus.sources.archives import ArchiveTable, MemberPath, archive_mark, find_archive, read_table
+from v2v_server.corpus.sources.archives import (
+    CHANGES_WHILE_READ,
+    ArchiveTable,
+    MemberPath,
+    find_archive,
+    name_in,
+    read_table,
+    same_ids,
+)
 from v2v_server.corpus.sources.listing import LIST_SUFFIXES, ListEntry, answers, count_left_out, read_list
 from v2v_server.corpus.sources.sidecars import check_local, is_sidecar, local_state, sidecar_id, state_of_parts
 from v2v_server.corpus.sources.source import (
@@ -27,8 +36,9 @@ from v2v_server.corpus.sources.source import (
     FileState,
     SourceOptions,
     VideoSource,
+    archive_mark,
     is_expected,
-    mark_of,
+    unmarked,
 )
 from v2v_server.kinds.kind import VideosKind
 from v2v_server.kinds.registry import VIDEOS
@@ -87,55 +97,28 @@ class Folder(VideoSource):
         try:
             if path.endswith("/"):
                 return state_of_parts(self, id, [(name, _numbers(status)) for name, status in files_in(path)])
-            try:
-                status = os.stat(path)
-            except (FileNotFoundError, NotADirectoryError):
-                if (member := self._member_state(id)) is None:
-                    raise
-                return member
-            size, modified, changed = _numbers(status)
+            if (member := self._member(id)) is not None:
+                mark = archive_mark(member.archive, _numbers(os.stat(self.path_of(member.archive))))
+                return unmarked(self, id, replace(member, mark=mark).state)
+            status = os.stat(path)
+        except (FileNotFoundError, NotADirectoryError) as error:
+            if not self.members and (archive := self.archive_of(id)):
+                raise VideoUnreadable(id, None, f"its place in {archive} is not known") from error
+            raise unreadable(id, error) from error
         except OSError as error:
             raise unreadable(id, error) from error
-        return (size, modified, changed ^ mark_of(self, id)) if stat.S_ISREG(status.st_mode) else GONE
+        return unmarked(self, id, _numbers(status)) if stat.S_ISREG(status.st_mode) else GONE
 
     def archive_of(self, id: str) -> str:
         """Return the archive that the id of a member leads into, below the folder; "" if it leads into none."""
         at, endings = f"{self.name}/", self.kind.archive_endings
         return find_archive(id, endings, lambda path: os.path.isdir(at + path), lambda path: os.path.isfile(at + path))
 
-    def _member_state(self, id: str) -> FileState | None:
-        """Return the state of a member of an archive; None if the id leads into none.
-
-        Raises:
-            OSError: the archive had no such member when it was listed, or this process was not told where it lies.
-        """
-        if not (archive := self.archive_of(id)):
-            return None
-        if not (place := self._place(id)):
-            raise OSError(errno.ENOENT if self.members else errno.EAGAIN, f"its place in {archive} is not known")
-        return place[0], place[1], self._mark(archive) ^ mark_of(self, id)
-
-    def _mark(self, archive: str) -> int:
-        return archive_mark(archive, _numbers(os.stat(f"{self.name}/{archive}")))
-
-    def _place(self, id: str) -> Sequence[int]:
-        """Return size and first byte of a member in its archive, as this process was told; nothing if it was not."""
-        return self.members.get(id) or (self.expected[1] if self.expected[0] == id else ())
-
     def _file(self, id: str) -> Path:
-        """Return a video's file, or the part of an archive that is one.
-
-        Raises:
-            VideoUnreadable: the archive has no such member, or cannot be read.
-        """
-        path = self.path_of(id)
-        if os.path.lexists(path) or not (archive := self.archive_of(id)):
-            return Path(path)
-        try:
-            size, start = (self._place(id) or self._table(archive).place(_name_in(archive, id)))[:2]
-        except OSError as error:
-            raise unreadable(id, error) from error
-        return cast(Path, FileRange(f"{self.name}/{archive}", start, start + size))
+        """Return a video's file, or the part of an archive that is one."""
+        if (member := self._member(id)) is None:
+            return Path(self.path_of(id))
+        return cast(Path, FileRange(self.path_of(member.archive), member.start, member.start + member.size))
 
     def _sidecar(self, id: str) -> Path:
         """Return where a sidecar lies, or would lie.
@@ -147,28 +130,19 @@ class Folder(VideoSource):
         if os.path.lexists(path) or not (archive := self.archive_of(id)):
             return path
         try:
-            mark, table = self._mark(archive), self._table(archive)
-            return cast(Path, MemberPath(f"{self.name}/{archive}", mark, _name_in(archive, id), table))  # type: ignore[abstract]
+            state = _numbers(os.stat(self.path_of(archive)))
+            table = self.tables.get(archive) or _read_once(self, archive, state)
         except OSError as error:
             raise unreadable(id, error) from error
+        member = MemberPath(self.path_of(archive), archive_mark(archive, state), name_in(archive, id), table)  # type: ignore[abstract]
+        return cast(Path, member)
 
-    def _table(self, archive: str) -> ArchiveTable:
-        """Return the table of an archive; a process that was not told where a member lies reads it once.
-
-        Raises:
-            OSError: it cannot be read, or is no archive.
-        """
-        try:
-            if (table := self.tables.get(archive)) is None:
-                table = _read_once(self, archive, _numbers(os.stat(f"{self.name}/{archive}")))
-            return table
-        except ValueError as error:
-            raise OSError(errno.EIO, str(error)) from error
-
-    def read_table(self, archive: str) -> bytes:
-        """Read the table of an archive, see :class:`HasArchives`."""
-        with open_bytes(f"{self.name}/{archive}") as file:
-            return read_table(file, archive, self.kind.id_of).to_bytes()
+    @contextmanager
+    def lend_archive(self, archive: str, state: FileState) -> Iterator[str]:
+        """Lend an archive's own path, see :meth:`HasArchives.lend_archive`."""
+        yield f"{self.name}/{archive}"
+        if self.state(archive) != state:
+            raise VideoChanged(archive, None, CHANGES_WHILE_READ)
 
     def open_local(self, id: str, fingerprint: str) -> AbstractContextManager[Path]:
         """Lend the file; only a sidecar of one file is checked.
@@ -251,14 +225,14 @@ class Folder(VideoSource):
         if is_sidecar(id):
             if os.path.lexists(self.path_of(id)) or not (archive := self.archive_of(id)):
                 check_local(self.folder / id, id, fingerprint, str(state or ""))
-            elif not str(state or "").startswith(f"{self._mark(archive):x} " if state else ""):
+            elif state and not str(state).startswith(f"{archive_mark(archive, self.state(archive)):x} "):
                 raise VideoChanged(id, None, f"{CHANGED}: {archive} is another file")
         elif os.path.isdir(path := self.path_of(id)):  # not as a worker has listed it
             check_fingerprint(path, fingerprint)
         else:
             if state is None and self.archive_of(id):
                 return  # its place is not known, and this process parses no archive
-            self.expected = id, state if isinstance(state, tuple) else ()
+            self.expected = id, unmarked(self, id, state) if isinstance(state, tuple) else ()
             with super().open_pixels(id, fingerprint) as pixels:
                 pixels.check(fingerprint)
 
@@ -312,12 +286,16 @@ class Folder(VideoSource):
 
 @lru_cache(maxsize=64)
 def _read_once(source: Folder, archive: str, state: FileState) -> ArchiveTable:
-    return ArchiveTable.from_bytes(source.read_table(archive), state[0])
+    """Return the table of an archive, in a process that was not told where a sidecar lies.
 
-
-def _name_in(archive: str, id: str) -> str:
-    """Return the name in its archive of a member of that id."""
-    return id[len(archive.rpartition(".")[0]) + 1 :].rstrip("/")
+    Raises:
+        OSError: it cannot be read, or is no archive.
+    """
+    try:
+        with open_bytes(source.path_of(archive)) as file:
+            return ArchiveTable.from_bytes(read_table(file, archive, source.kind.id_of).to_bytes(), state[0])
+    except ValueError as error:
+        raise OSError(errno.EIO, str(error)) from error
 
 
 def _numbers(status: os.stat_result) -> FileState:
@@ -388,7 +366,7 @@ def video_files(
         left_out: counts, by suffix, files that may be videos of other endings; and, by path, folders of outputs.
         kind: what a video is; the id of a folder of pictures ends with a slash.
     """
-    id_of, pseudo, paths_of = kind.id_of, pseudo_devices(), Counter[tuple[int, int]]()
+    pseudo, paths_of = pseudo_devices(), Counter[tuple[int, int]]()
 
     def below(folder: Path, prefix: str, above: frozenset[tuple[int, int]], links: int) -> Iterator[list[str]]:
         """Yield the videos below a folder, some at a time.
@@ -439,18 +417,15 @@ def video_files(
                 found = []
                 more = links + entry.is_symlink()
                 yield from below(folder / entry.name, f"{relative}/", above | {identity}, more)
-            elif id := id_of(relative) or (relative if relative.endswith(kind.archive_endings) else ""):
-                stem = "" if id_of(relative) else entry.name.rpartition(".")[0]
-                same = [stem + ending for ending in ("", *kind.archive_endings) if stem and stem + ending in names]
+            elif id := kind.entry_of(relative):
                 if printable(relative) != relative:
                     refused[printable(relative)] = UNPRINTABLE
                 elif not is_file:
                     refused[relative] = "is not a regular file, or is a broken link"
                 elif is_pseudo:
                     refused[relative] = PSEUDO
-                elif stem and same != [entry.name]:
-                    other = next(name for name in same if name != entry.name)
-                    refused[relative] = f"would give the same ids as {other} beside it: move one of them away"
+                elif why := same_ids(entry.name, kind.archive_endings, names.__contains__):
+                    refused[relative] = why
                 else:
                     found.append(id)
             elif is_file:

@@ -9,6 +9,7 @@ Errors are the same for every source: :class:`VideoGone` (not there), :class:`Vi
 
 from __future__ import annotations
 
+import hashlib
 import os
 from abc import ABC, abstractmethod
 from array import array
@@ -45,6 +46,53 @@ NO_STATE: FileState = (-1, 0, 0)
 """The state cannot be told now."""
 GONE: FileState = (-2, 0, 0)
 """There is no such file."""
+_ARCHIVE_ENDINGS = ".tar", ".zip"
+_START_BITS = 48
+_IS_MEMBER = 1 << 62
+"""Of the last number of a state. A time is below it until 2116, and that of an object is 0."""
+
+
+@dataclass(frozen=True, slots=True)
+class MemberPlace:
+    """Where the bytes of a video lie in an archive. Its state says that, so what has the state reads no table.
+
+    Attributes:
+        archive: its path below the source.
+        size: of the video, bytes.
+        start: its first byte in the archive; in a zip file of object storage, that of its header.
+        mark: changes with the archive, see :func:`archive_mark`.
+    """
+
+    archive: str
+    size: int
+    start: int
+    mark: int
+
+    @property
+    def state(self) -> FileState:
+        """Return the state of the video, without :func:`mark_of`."""
+        stem, dot, ending = self.archive.rpartition(".")
+        place = len(stem) * len(_ARCHIVE_ENDINGS) + _ARCHIVE_ENDINGS.index(dot + ending)
+        return self.size, place << _START_BITS | self.start, self.mark
+
+    @classmethod
+    def of(cls, id: str, state: Sequence[int]) -> MemberPlace | None:
+        """Return where a video of that state lies; None if it is a file of its own."""
+        if not state or state[2] < _IS_MEMBER:
+            return None
+        length, ending = divmod(state[1] >> _START_BITS, len(_ARCHIVE_ENDINGS))
+        start = state[1] & ((1 << _START_BITS) - 1)
+        return cls(id[:length] + _ARCHIVE_ENDINGS[ending], state[0], start, state[2])
+
+    def is_in(self, state: FileState) -> bool:
+        """Return whether the archive in this state is the catalogued one."""
+        return archive_mark(self.archive, state) == self.mark
+
+
+def archive_mark(path: str, state: FileState) -> int:
+    """Return a number that changes with an archive: by its ending and its state."""
+    text = repr((path.rpartition(".")[2], *state))
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8]) >> 2 | _IS_MEMBER
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +146,7 @@ class VideoSource(ABC):
         copies: the folder for copies of its files; None without one.
         expected: the id of the video that is opened next, and its catalogued state without :func:`mark_of`. A file or
             object that is in this state need not be read whole; that of a member says where it lies in its archive.
-        members: states of the videos in archives, by id, while the corpus is being opened.
+        members: states of the videos in archives, by id, without :func:`mark_of`, while the corpus is being opened.
         tables: what its archives hold, by path, for as long (:class:`v2v_server.corpus.sources.archives.ArchiveTable`).
     """
 
@@ -156,6 +204,15 @@ class VideoSource(ABC):
             CorpusError: the source cannot be listed, or cannot be served.
         """
 
+    def _member(self, id: str, state: Sequence[int] = ()) -> MemberPlace | None:
+        """Return where a video lies in an archive; None if it is a file of its own, or this process was not told.
+
+        Args:
+            state: as catalogued, without :func:`mark_of`; empty: as this process was told.
+        """
+        told = self.expected[1] if self.expected[0] == id else ()
+        return MemberPlace.of(id, state or self.members.get(id) or told)
+
     @abstractmethod
     def state(self, id: str) -> FileState:
         """Ask for the state of one file now.
@@ -171,7 +228,8 @@ class VideoSource(ABC):
         found = array("q")
         for id in ids:
             try:
-                found.extend(self.members[id] if id in self.members else self.state(id))
+                told = self.members.get(id)
+                found.extend(unmarked(self, id, told) if told else self.state(id))
             except VideoUnreadable as error:
                 found.extend(GONE if isinstance(error, VideoGone) else NO_STATE)
         return found
@@ -256,7 +314,9 @@ def mark_of(source: VideoSource, id: str) -> int:
 
 
 def unmarked(source: VideoSource, id: str, state: FileState) -> FileState:
-    """Return a state without the mark, which a worker does not know: it has no flags of the kind, and no list."""
+    """Return a state without the mark, which a worker does not know: it has no flags of the kind, and no list. Of a
+    state without the mark, return that with it.
+    """
     return state[0], state[1], state[2] ^ mark_of(source, id)
 
 

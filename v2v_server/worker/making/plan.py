@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.sample import SampleParams, needs_of
-from v2v_protocol.spec import MARGIN_PX, MOST_SUBSTEPS, StreamSpec
+from v2v_protocol.spec import MARGIN_PX, StreamSpec
 from v2v_server.flow import FlowSettings
 from v2v_server.kinds.registry import kind_of
 from v2v_server.motion import cells_of
@@ -141,5 +141,4 @@ def _variants(
     arrays: tuple[str, ...],
 ) -> frozenset[Variant]:
     step_seconds = spec.recipe.frame_stride / frames_per_second
-    levels_per_step = MOST_SUBSTEPS - 1 if spec.substep_px else 0
-    return variants(spec.recipe, spec.voxel_dtype, step_seconds, thresholds, arrays, levels_per_step)
+    return variants(spec.recipe, spec.voxel_dtype, step_seconds, thresholds, arrays, spec.levels_per_step)
