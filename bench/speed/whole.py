@@ -21,7 +21,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +31,8 @@ from av.video.frame import VideoFrame
 
 from bench.frame import Column, Report, add_whole, beyond, chosen, medians, progress
 from v2v_protocol.command import Parser
-from v2v_protocol.events import EventList
-from v2v_recordings.writers import EVENT_FORMS, EventForm, EventWriter
+from v2v_recordings.items import EventChunk
+from v2v_recordings.writers import EVENT_FORMS, EventForm
 from v2v_tools import simulate
 
 WIDTH, HEIGHT, RATE, PERIOD = 1280, 720, 30, 64
@@ -52,12 +52,10 @@ _COLUMNS: tuple[Column, ...] = (
 )
 
 
-class _Nothing(EventWriter):
-    def _open(self) -> None:
-        """Create no file."""
-
-    def _write(self, events: EventList) -> None:
-        """Drop the events."""
+def write_nothing(*_: object) -> Generator[None, EventChunk | None, None]:
+    """Take the pieces of a recording and drop them."""
+    while (yield):
+        pass
 
 
 def write_video(path: Path, frames: int, moving_px: int) -> None:
@@ -154,7 +152,7 @@ def add_flags(parser: Parser) -> None:
 
 def measure(asked: argparse.Namespace) -> Report:
     """Run the bench."""
-    EVENT_FORMS["none"] = EventForm("", "npz", _Nothing)
+    EVENT_FORMS["none"] = EventForm("", "npz", write_nothing)
     forms = chosen(asked.forms or ",".join(FORMS[asked.memory :]), EVENT_FORMS, "--forms")
     with tempfile.TemporaryDirectory(prefix="v2v-whole-") as name:
         records = list(memory(Path(name), forms) if asked.memory else times(Path(name), asked, forms))
