@@ -337,20 +337,21 @@ def _write_dsec(path: Path, size: SensorSize, _: Mapping[str, _Planes]) -> _Writ
     with write_aside_and_rename(path) as partial, open_new(partial) as (file, disk):
         file.attrs.update(width=size.width, height=size.height, note=_NOTE)
         dtypes = {"events/x": "u2", "events/y": "u2", "events/t": "i8", "events/p": "u1", "ms_to_idx": "u8"}
-        for name, dtype in dtypes.items():
-            file.create_dataset(
-                name, (0,), dtype, maxshape=(None,), chunks=(EVENTS_AT_ONCE,), compression="gzip", compression_opts=1
-            )
-        written = 0
+        packed = {"compression": "gzip", "compression_opts": 1}
+        columns = [
+            file.create_dataset(name, (0,), dtype, maxshape=(None,), chunks=(EVENTS_AT_ONCE,), **packed)
+            for name, dtype in dtypes.items()
+        ]
+        first_of_ms, written = columns[-1], 0
         while piece := (yield):
             disk.check()
             t_us = piece.t_ns // 1000
-            next_ms = 1000 * np.arange(len(file["ms_to_idx"]), int(t_us[-1]) // 1000 + 1)
-            columns = piece.x, piece.y, t_us, piece.p, written + np.searchsorted(t_us, next_ms)
-            for name, values in zip(dtypes, columns, strict=True):
-                append(file[name], values)
+            next_ms = 1000 * np.arange(len(first_of_ms), int(t_us[-1]) // 1000 + 1)
+            values = piece.x, piece.y, t_us, piece.p, written + np.searchsorted(t_us, next_ms)
+            for column, added in zip(columns, values, strict=True):
+                append(column, added)
             written += len(piece)
-        append(file["ms_to_idx"], np.full(1 if written else 2, written))
+        append(first_of_ms, np.full(1 if written else 2, written))
         file["t_offset"] = np.int64(0)
 
 
