@@ -14,13 +14,6 @@ _WORD_BITS, _DIGIT_BITS = 63, 11
 """Bits of a word of the sort, and how many of a time one pass looks at."""
 
 
-class EventRows(NamedTuple):
-    """Memory for events, [capacity, 2] int64, and for the sort, [capacity] int64."""
-
-    own: Any
-    spare: Any
-
-
 class Listing(NamedTuple):
     """The listed events, and when the segments are.
 
@@ -35,11 +28,6 @@ class Listing(NamedTuple):
     span_us: Any
     first_us: Any
     last_us: Any
-
-
-def new_rows(capacity: int) -> EventRows:
-    """Return memory for events."""
-    return EventRows(np.empty((capacity, 2), np.int64), np.empty(capacity, np.int64))
 
 
 def prepare(memory, given, segments, real):
@@ -66,38 +54,43 @@ def events(tables, train):
     return 0
 
 
-def columns_in_order(rows, spare, width, place, t, p):
-    """Sort events by time, those of a microsecond by pixel, and write their columns; equal ones stay in their order.
+def columns_in_order(rows, width):
+    """Return x, y, t and p of events by time, those of a microsecond by pixel; equal ones stay in their order.
 
     Args:
-        rows: [n, 2] int64, as listed; changed, as is ``spare``, [n] int64.
+        rows: [n, 2] int64, as listed; changed.
         width: of the picture, px.
-        place: [2, n] uint16, x and y; ``t``: [n] int64; ``p``: [n] bool; all written.
+
+    Returns:
+        [n] uint16, uint16, int64 and bool.
     """
-    if len(rows) == 0:
-        return
-    times, codes = rows.T
-    first = int(times.min())
-    code_bits, time_bits = (int(codes.max()) | 1).bit_length(), (int(times.max()) - first).bit_length()
-    if code_bits + time_bits < _WORD_BITS:
-        _columns_of_words(rows, spare, first, code_bits, time_bits, np.uint32(width), place, t, p)
-        return
-    t[:], codes = rows[np.lexsort((codes >> 1, times))].T
-    place[1], place[0], p[:] = (codes >> 1) // width, (codes >> 1) % width, codes & 1
+    count = len(rows)
+    (x, y), t, p = np.empty((2, count), np.uint16), np.empty(count, np.int64), np.empty(count, np.bool_)
+    if count:
+        times, codes = rows.T
+        first = int(times.min())
+        code_bits, time_bits = (int(codes.max()) | 1).bit_length(), (int(times.max()) - first).bit_length()
+        if code_bits + time_bits < _WORD_BITS:
+            _columns_of_words(rows, first, code_bits, time_bits, np.uint32(width), x, y, t, p)
+        else:
+            t[:], codes = rows[np.lexsort((codes >> 1, times))].T
+            y[:], x[:], p[:] = (codes >> 1) // width, (codes >> 1) % width, codes & 1
+    return x, y, t, p
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def _columns_of_words(rows, spare, first, code_bits, time_bits, width, place, t, p):
-    """Do it with an event in a word: its time after ``first`` in the upper bits."""
+def _columns_of_words(rows, first, code_bits, time_bits, width, x, y, t, p):
+    """Write the columns; the sort sees an event as one word, with its time after ``first`` in the upper bits."""
     passes = -(-time_bits // _DIGIT_BITS)
     digit = -(-time_bits // max(passes, 1))
-    mask, ends = (1 << digit) - 1, np.zeros((max(passes, 1), (1 << digit) + 1), np.int64)
+    words, mask = np.empty(len(rows), np.int64), (1 << digit) - 1
+    ends = np.zeros((max(passes, 1), (1 << digit) + 1), np.int64)
     for i in range(len(rows)):
         time = rows[i, 0] - first
-        spare[i] = time << code_bits | rows[i, 1]
+        words[i] = time << code_bits | rows[i, 1]
         for number in range(passes):
             ends[number, (time >> number * digit & mask) + 1] += 1
-    words, other = spare, rows.reshape(-1)[: len(rows)]
+    other = rows.reshape(-1)[: len(rows)]
     for number in range(passes):
         shift = code_bits + number * digit
         for value in range(1 << digit):
@@ -117,6 +110,6 @@ def _columns_of_words(rows, spare, first, code_bits, time_bits, width, place, t,
             words[begin:end] = words[begin:end][np.argsort(words[begin:end] >> 1, kind="mergesort")]
     for i in range(len(words)):
         pixel = np.uint32((words[i] & ((1 << code_bits) - 1)) >> 1)
-        y = np.uint32(pixel // width)
-        place[1, i], place[0, i] = y, pixel - y * width
+        row = np.uint32(pixel // width)
+        y[i], x[i] = row, pixel - row * width
         t[i], p[i] = first + (words[i] >> code_bits), words[i] & 1 == 1
