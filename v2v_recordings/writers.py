@@ -273,7 +273,7 @@ def _write_npz(path: Path, size: SensorSize, planes: Mapping[str, _Planes]) -> _
         while piece := (yield):
             for each, values in zip(rows.values(), (piece.t_ns // 1000, piece.x, piece.y, piece.p), strict=True):
                 each.append(values)
-        stated = {f"{kind}_ts": each.seconds for kind, each in planes.items()}
+        stated: dict[str, npt.ArrayLike] = {f"{kind}_ts": each.seconds for kind, each in planes.items()}
         stated |= {"width": np.int64(size.width), "height": np.int64(size.height), "note": np.array(_NOTE)}
         with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             for name, each in {**rows, **planes}.items():

@@ -275,11 +275,11 @@ def _time(each, number, block, old, first, last, folds, made, clipped):
         folds: of the noise's words for these times.
     """
     found, count = block.words[0], 0
-    for i in range(last - first):  # without a branch: most pixels have none
-        found[count] = i
-        count += block.rises[i] + block.falls[i] > 0
-    for each_found in range(count):
-        i = np.int64(found[each_found])
+    for pixel in range(last - first):  # without a branch: most pixels have no events
+        found[count] = pixel
+        count += block.rises[pixel] + block.falls[pixel] > 0
+    for place in range(count):
+        i = np.int64(found[place])
         for is_rising in range(2):
             events = int(block.rises[i] if is_rising else block.falls[i])
             if events == 0:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+import numpy.typing as npt
 
 from v2v_server.simulation.effects.state import hook
 
@@ -54,7 +55,7 @@ def events(tables, train):
     return 0
 
 
-def columns_in_order(rows, width):
+def columns_in_order(rows: npt.NDArray[np.int64], width: int) -> tuple[Any, Any, Any, Any]:
     """Return x, y, t and p of events by time, those of a microsecond by pixel; equal ones stay in their order.
 
     Args:
