@@ -130,12 +130,15 @@ class EventWriter:
             return
         self._check(events)
         self._last_us, self.events = int(events.t[-1]), self.events + len(events)
-        chunk, first = EventChunk(events.t * 1000, events.x, events.y, events.p), 0
-        for last in range(EVENTS_AT_ONCE - len(self._pending), len(chunk) + 1, EVENTS_AT_ONCE):
-            with self._words():
-                self._file.send(EventChunk.join([self._pending, chunk.part(first, last)]))
-            self._pending, first = _NO_EVENTS, last
-        self._pending = EventChunk.join([self._pending, chunk.part(first)])
+        taken = 0
+        while taken < len(events):
+            part = slice(taken, taken + EVENTS_AT_ONCE - len(self._pending))
+            piece = EventChunk(events.t[part] * 1000, events.x[part], events.y[part], events.p[part])
+            self._pending, taken = EventChunk.join([self._pending, piece]), taken + len(piece)
+            if len(self._pending) == EVENTS_AT_ONCE:
+                with self._words():
+                    self._file.send(self._pending)
+                self._pending = _NO_EVENTS
 
     def add_picture(self, microseconds: int, picture: npt.NDArray[np.uint8]) -> None:
         """Add a picture, uint8 [H, W], not earlier than the one before it. Its events may be added before or after."""

@@ -13,8 +13,8 @@ from v2v_server.simulation.kernels import Carried, KernelInput, list_piece
 from v2v_server.simulation.precision import Real
 from v2v_server.simulation.voxel import Doubles, Levels, Moments, bin_edges
 
-PIECE_EVENTS = 1 << 22
-"""Events of a piece, unless a single step has more: 96 MiB to list and sort them."""
+PIECE_EVENTS = 1 << 21
+"""Events of a piece, unless a single step has more: 48 MiB to list and sort them."""
 _FULL = 0.8
 """Part of them that the next piece should have, if its steps fire as often as those of the last one."""
 
