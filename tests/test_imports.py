@@ -63,7 +63,7 @@ FLOORS = (
     "config", "corpus", "lease_memory", "corpus_words", "schedule",
     "quarantine", "sharing",
     "broker",
-    "worker", "supervise", "status", "prepare", "page",
+    "worker", "supervise", "status", "prepare", "prepare_recordings", "page",
     "serve", "commands",
 )  # fmt: skip
 """The rooms of the server, from the ground up: each imports only from itself and from those before it."""

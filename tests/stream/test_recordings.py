@@ -17,9 +17,10 @@ from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.errors import CorpusError, SampleUnavailable, UsageError, V2VError
 from v2v_protocol.spec import StreamSpec
+from v2v_recordings.block_file import EventFileWriter
+from v2v_recordings.items import EventChunk, SensorSize
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.kinds.registry import kind_from
-from v2v_server.recorded.blocks import EventFileWriter, PackedEvents
 from v2v_server.schedule import SequenceTable
 from v2v_tools.remake import remake
 
@@ -120,10 +121,9 @@ def without_pictures(tmp_path: Path) -> Path:
     """A recording of events alone, with a pause that is longer than a block can hold."""
     at = np.arange(2000)
     times = 1_000_000 * at + 5_000_000_000 * (at > 1000)
-    with (tmp_path / "a.v2ve").open("wb") as file:
-        writer = EventFileWriter(file)
-        writer.add(PackedEvents.of(times, at % 64, at % 48, at % 2))
-        writer.finish(48, 64, "")
+    with EventFileWriter(tmp_path / "a.v2ve", source="a", fingerprint="") as writer:
+        writer.add(SensorSize(64, 48))
+        writer.add(EventChunk(times, at % 64, at % 48, at % 2 == 1))
     return tmp_path
 
 

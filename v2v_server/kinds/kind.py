@@ -64,7 +64,7 @@ class VideosKind:
         shown_arrays: arrays of every video that a preview draws; empty: those of its sidecars.
         unprepared: why ``v2v-prepare`` does not take it; "" if it does.
         converter: module that makes its videos of other files for ``v2v-prepare``
-            (:mod:`v2v_server.recorded.convert`); "" if none does.
+            (:mod:`v2v_server.prepare_recordings`); "" if none does.
 
     Raises:
         UsageError: a flag is outside its limits.

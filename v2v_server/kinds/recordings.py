@@ -46,7 +46,7 @@ class RecordingKind(VideosKind):
     looked_for = f".v2ve, the form that {_PREPARES} makes of recordings"
     has_sidecars = has_scenes = has_motion = is_simulated = False
     unprepared = f"recordings are prepared from their raw files: {_PREPARES}"
-    converter = "v2v_server.recorded.convert"
+    converter = "v2v_server.prepare_recordings"
 
     rate: float = number(*RATE, unit="Hz", metavar="N")
     marks: str = text(

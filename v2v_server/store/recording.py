@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.sample import ARRAYS, RECORDING_FORMAT, array_layout, new_arrays
-from v2v_server.recorded.blocks import NO_EVENTS, EventFile
+from v2v_recordings.block_file import NO_EVENTS
+from v2v_server.store.event_file import EventFile
 from v2v_server.video.decode import ClipRequest, Cut, DecodedClip, DecodedPicture, SampleView
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.frame_index import LARGEST_FRAMES, unseekable
@@ -64,7 +65,7 @@ class RecordedPixels(EventFile):
     def marks(self) -> npt.NDArray[np.int64]:
         """Return the times of the marks, [n] nanoseconds."""
         if self._rate:
-            ends = self.times_of_every(max(1, self.head.events - 1))
+            ends = self.times_of_every(max(1, self.head.events - 1), 2)
             count = int((ends[-1] - ends[0]) * 1e-9 * self._rate + 1e-9) + 1 if len(ends) else 0
             steps: npt.NDArray[np.int64] = np.rint(np.arange(min(count, LARGEST_FRAMES)) * (1e9 / self._rate)).astype(
                 int
@@ -73,7 +74,7 @@ class RecordedPixels(EventFile):
         if self._marks in ("pictures", "flow"):
             table = self.pictures_table if self._marks == "pictures" else self.flows
             return np.array(table["t_ns"], np.int64)
-        return self.times_of_every(int(self._marks.removesuffix("events")))
+        return self.times_of_every(int(self._marks.removesuffix("events")), LARGEST_FRAMES)
 
     def check(self, fingerprint: str) -> None:
         """Compare size, head and tail, which holds the hashes of all pieces."""
@@ -119,7 +120,7 @@ class RecordedPixels(EventFile):
         self, clip: DecodedClip, times: npt.NDArray[np.int64], usable: PixelRect, view: SampleView
     ) -> DecodedClip:
         """Return a clip with the arrays of a sample that are made of events, and true flow; ``times``: [n] marks."""
-        from v2v_server.recorded.bins import Grids, fill_arrays  # a catalogue must not load numba
+        from v2v_server.recorded import Grids, fill_arrays  # a catalogue must not load numba
 
         recipe, params = view.spec.recipe, view.params
         ends = params.ends(recipe)

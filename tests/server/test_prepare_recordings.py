@@ -19,12 +19,12 @@ from v2v_protocol.recipe import preset
 from v2v_protocol.sample import array_layout, new_arrays
 from v2v_recordings.items import EventChunk, FlowField, Note, Picture, SensorSize
 from v2v_recordings.layout_writer import RecordingWriter
+from v2v_server import prepare_recordings
 from v2v_server.commands import prepare
-from v2v_server.recorded import convert
-from v2v_server.recorded.bins import Grids, fill_arrays
-from v2v_server.recorded.blocks import EventFile, PackedEvents
-from v2v_server.recorded.convert import convert_recordings
+from v2v_server.prepare_recordings import convert_recordings
+from v2v_server.recorded import Grids, fill_arrays
 from v2v_server.simulation.draw import draw
+from v2v_server.store.event_file import EventFile
 
 CASES = WITH_PICTURES | WITHOUT
 LONGEST_SECONDS = 5.0
@@ -47,8 +47,8 @@ def test_every_raw_form_gives_the_known_voxel_grids(case: str, prepared: Path) -
     (path,) = (prepared / case).rglob("*.v2ve")
     with EventFile(path) as recording:
         events = recording.between(-(2**62), 2**62)
-        packed = PackedEvents.of(original.t_us, original.x, original.y, original.p).packed
-        assert np.array_equal(events.packed, packed)
+        for name in ("x", "y", "p"):
+            assert np.array_equal(getattr(events, name), getattr(original, name)), name
         assert np.array_equal(np.diff(events.t_ns), 1000 * np.diff(original.t_us))
         assert len(recording.pictures_table) == (WINDOWS + 1 if has_pictures else 0)
         if not has_pictures:
@@ -127,7 +127,10 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     "c": (_header_of_npy, "is stated to be"),
     "d.aedat4": (lambda path: path.write_bytes(b"#!AER-DAT4" + bytes(1000)), "d.aedat4"),
     "e.txt": (lambda path: path.write_text("1e300 1 1 1\n2e300 1 1 1\n"), "out of range"),
-    "f.txt": (lambda path: path.write_text("0.1 5000 1 1\n0.2 1 1 1\n0.3 1 1 0\n"), "beyond 4096 px"),
+    "f.txt": (
+        lambda path: path.write_text("0.1 5000 1 1\n0.2 1 1 1\n0.3 1 1 0\n"),
+        "coordinates must be from 0 to 4095",
+    ),
 }
 
 
@@ -143,25 +146,25 @@ def test_hostile_recordings_are_refused_soon(name: str, tmp_path: Path) -> None:
     assert not list((tmp_path / "prepared").rglob("*.v2ve"))
 
 
-def _sleep_on(job: convert.Conversion) -> convert.PreparedRecording:
+def _sleep_on(job: prepare_recordings.Conversion) -> prepare_recordings.PreparedRecording:
     time.sleep(600.0)
     raise AssertionError
 
 
-def _take_all_memory(job: convert.Conversion) -> convert.PreparedRecording:
+def _take_all_memory(job: prepare_recordings.Conversion) -> prepare_recordings.PreparedRecording:
     try:
-        np.ones(convert.MOST_MEMORY_BYTES, np.uint8)
+        np.ones(prepare_recordings.MOST_MEMORY_BYTES, np.uint8)
     except MemoryError:
-        return convert.PreparedRecording(job.id, problem="too much")
+        return prepare_recordings.PreparedRecording(job.id, problem="too much")
     raise AssertionError
 
 
 @pytest.mark.parametrize(("reader", "words"), [(_sleep_on, "s without a result"), (_take_all_memory, "too much")])
 def test_reading_has_limits(reader: Any, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recording_of(tmp_path / "raw/a.h5")
-    monkeypatch.setattr(convert, "convert_recording", reader)
+    monkeypatch.setattr(prepare_recordings, "convert_recording", reader)
     if reader is _sleep_on:
-        monkeypatch.setattr(convert, "_LEAST_SECONDS", 0.0)
+        monkeypatch.setattr(prepare_recordings, "_LEAST_SECONDS", 0.0)
     (made,) = convert_recordings(tmp_path / "raw", tmp_path / "prepared", 1)
     assert words in made.problem
 

@@ -16,17 +16,17 @@ from hypothesis import strategies as st
 from trainer.evaluation import voxelise
 from v2v_protocol.recipe import Recipe, preset
 from v2v_protocol.sample import SampleParams, array_layout, new_arrays
-from v2v_recordings.items import ConvertOptions
+from v2v_recordings.block_file import NO_EVENTS, EventFileWriter
+from v2v_recordings.items import ConvertOptions, EventChunk
 from v2v_recordings.reading import read_items
-from v2v_server.recorded.bins import Grids, fill_arrays
-from v2v_server.recorded.blocks import EventFile, EventFileWriter, PackedEvents
-from v2v_server.recorded.convert import write_items
+from v2v_server.recorded import Grids, fill_arrays
 from v2v_server.simulation.draw import draw
+from v2v_server.store.event_file import EventFile
 
 ALL = ("voxels", "event_counts", "voxels_bilinear", "time_surface")
 KINDS = {"voxels": "discrete", "voxels_bilinear": "interpolated"}
 SPANS = {"grid": "window", "events": "events"}
-SHARED = Path(os.environ.get("V2V_TEST_EVENTS", Path(__file__).parents[4] / "shared/data/events"))
+SHARED = Path(os.environ.get("V2V_TEST_EVENTS", Path(__file__).parents[3] / "shared/data/events"))
 """Real recordings, which only some hosts have."""
 
 
@@ -42,8 +42,13 @@ def params_of(recipe: Recipe, index: int = 0) -> SampleParams:
     )  # fmt: skip
 
 
+def events_of(t_ns: npt.ArrayLike, *columns: npt.ArrayLike) -> EventChunk:
+    x, y, p = map(np.asarray, columns)
+    return EventChunk(np.asarray(t_ns, np.int64), x.astype(np.uint16), y.astype(np.uint16), p.astype(bool))
+
+
 def made(
-    events: PackedEvents, edges: npt.NDArray[np.int64], recipe: Recipe, dtype: str = "float32",
+    events: EventChunk, edges: npt.NDArray[np.int64], recipe: Recipe, dtype: str = "float32",
     window: tuple[int, int, int, int] | None = None, params: SampleParams | None = None,
 ) -> tuple[dict[str, Any], dict[str, int]]:  # fmt: skip
     recipe = recipe.replace(voxels_per_clip=len(edges) - 1)
@@ -56,19 +61,18 @@ def made(
 
 
 def evaluated(
-    events: PackedEvents, edges: npt.NDArray[np.int64], size: tuple[int, int], settings: voxelise.VoxelSettings
+    events: EventChunk, edges: npt.NDArray[np.int64], size: tuple[int, int], settings: voxelise.VoxelSettings
 ) -> npt.NDArray[np.float32]:
     """Return evaluation's grids of the same events, [G, bins, H, W]."""
     grids = []
     for begin, end in pairwise(edges.tolist()):
         part = events.part(*np.searchsorted(events.t_ns, (begin, end)).tolist())
-        x, y, sign = part.packed >> 1 & 4095, part.packed >> 13, 2.0 * (part.packed & 1) - 1
-        columns = voxelise.Events(part.t_ns * 1e-9, x, y, sign.astype(np.float32))
+        columns = voxelise.Events(part.t_ns * 1e-9, part.x, part.y, 2 * part.p.astype(np.float32) - 1)
         grids.append(voxelise.voxel_grid(columns, size, settings, (begin * 1e-9, end * 1e-9)))
     return np.stack(grids)
 
 
-def assert_as_evaluated(events: PackedEvents, edges: npt.NDArray[np.int64], size: tuple[int, int], bins: int) -> None:
+def assert_as_evaluated(events: EventChunk, edges: npt.NDArray[np.int64], size: tuple[int, int], bins: int) -> None:
     for bin_span, span in SPANS.items():
         arrays, _ = made(events, edges, recipe_of(*size, bins=bins, bin_span=bin_span))
         for name, kind in KINDS.items():
@@ -79,26 +83,26 @@ def assert_as_evaluated(events: PackedEvents, edges: npt.NDArray[np.int64], size
 
 
 @st.composite
-def clips(draw: st.DrawFn) -> tuple[PackedEvents, npt.NDArray[np.int64]]:
+def clips(draw: st.DrawFn) -> tuple[EventChunk, npt.NDArray[np.int64]]:
     """Return events on whole microseconds, and the edges of grids, some of them empty."""
     steps = draw(st.lists(st.sampled_from([0, 0, 1, 7, 500, 33_333]), min_size=1, max_size=60))
     times = 1000 * (draw(st.integers(0, 10**7)) + np.cumsum(steps))
     of = [draw(st.lists(st.integers(0, most), min_size=len(steps), max_size=len(steps))) for most in (5, 3, 1)]
     last = int(times[-1]) // 1000 + 5
     edges = draw(st.lists(st.integers(int(times[0]) // 1000 - 5, last), min_size=2, max_size=6))
-    return PackedEvents.of(times, *of), 1000 * np.sort(np.array(edges, np.int64))
+    return events_of(times, *of), 1000 * np.sort(np.array(edges, np.int64))
 
 
 @settings(max_examples=80)
 @given(clip=clips(), bins=st.integers(1, 7))
-def test_grids_are_those_of_evaluation(clip: tuple[PackedEvents, npt.NDArray[np.int64]], bins: int) -> None:
+def test_grids_are_those_of_evaluation(clip: tuple[EventChunk, npt.NDArray[np.int64]], bins: int) -> None:
     assert_as_evaluated(*clip, (4, 6), bins)
 
 
 @settings(max_examples=40)
 @given(clip=clips(), flip=st.booleans(), top=st.integers(0, 2), left=st.integers(0, 3))
 def test_a_crop_and_a_flip_take_a_part_of_the_sensor(
-    clip: tuple[PackedEvents, npt.NDArray[np.int64]], flip: bool, top: int, left: int
+    clip: tuple[EventChunk, npt.NDArray[np.int64]], flip: bool, top: int, left: int
 ) -> None:
     whole, _ = made(*clip, recipe_of(4, 6))
     part, _ = made(*clip, recipe_of(2, 3, flip_probability=float(flip)), window=(top, left, 2, 3))
@@ -109,25 +113,23 @@ def test_a_crop_and_a_flip_take_a_part_of_the_sensor(
 
 @settings(max_examples=40)
 @given(clip=clips(), bins=st.integers(1, 4))
-def test_a_time_surface_is_the_age_of_the_last_event(
-    clip: tuple[PackedEvents, npt.NDArray[np.int64]], bins: int
-) -> None:
+def test_a_time_surface_is_the_age_of_the_last_event(clip: tuple[EventChunk, npt.NDArray[np.int64]], bins: int) -> None:
     events, edges = clip
     ages = made(events, edges, recipe_of(4, 6, bins=bins))[0]["time_surface"]
     for grid, (begin, end) in enumerate(pairwise(edges.tolist())):
         for number in range(bins):
             seen = np.full((2, 4, 6), np.inf)
             stop = begin + (end - begin) * (number + 1) / bins
-            for time, packed in zip(events.t_ns.tolist(), events.packed.tolist(), strict=True):
+            for time, x, y, p in zip(events.t_ns.tolist(), events.x, events.y, events.p, strict=True):
                 # A whole microsecond at the edge of a bin belongs to the bin that evaluation puts it into.
                 in_bin = bins * ((time - begin) / max(1, end - begin))
                 if edges[0] <= time < end and (time < begin or int(in_bin) <= number):
-                    seen[packed & 1, packed >> 13, packed >> 1 & 4095] = max(stop - time, 0.0) * 1e-9
+                    seen[int(p), y, x] = max(stop - time, 0.0) * 1e-9
             assert np.allclose(ages[grid, :, number], seen, rtol=1e-6, atol=1e-9)
 
 
 def test_counts_beyond_the_dtype_are_clipped_and_counted() -> None:
-    events = PackedEvents.of(np.arange(300) * 1000, np.zeros(300), np.zeros(300), np.ones(300))
+    events = events_of(np.arange(300) * 1000, np.zeros(300), np.zeros(300), np.ones(300))
     arrays, clipped = made(events, np.array([0, 300_000]), recipe_of(2, 2, bins=1), "int8")
     assert arrays["voxels"][0, 0].tolist() == [[127, 0], [0, 0]]
     assert clipped == {"voxels": 1, "event_counts": 1}
@@ -137,7 +139,7 @@ def test_added_noise_has_its_sigma_and_hot_pixels_stay() -> None:
     fields = {"added_sigma": (0.1, 0.1), "added_hot_share": (0.01, 0.01), "added_hot_sigma": (5.0, 5.0)}
     recipe = recipe_of(64, 64, **fields)
     edges = np.arange(5) * 1_000_000
-    none = PackedEvents.of([], [], [], [])
+    none = NO_EVENTS
     arrays, _ = made(none, edges, recipe)
     noise = arrays["voxels"]
     assert np.array_equal(noise, arrays["voxels_bilinear"])
@@ -158,10 +160,11 @@ def test_added_noise_has_its_sigma_and_hot_pixels_stay() -> None:
 def test_real_recordings_give_the_grids_of_evaluation(name: str, tmp_path: Path) -> None:
     if not (SHARED / name).exists():
         pytest.skip("the shared recordings are not on this host")
-    with (tmp_path / "a.v2ve").open("wb") as file:
-        write_items(EventFileWriter(file), read_items(SHARED / name, None, ConvertOptions()), name)
+    with EventFileWriter(tmp_path / "a.v2ve", source=name, fingerprint="") as writer:
+        for item in read_items(SHARED / name, None, ConvertOptions()):
+            writer.add(item)
     with EventFile(tmp_path / "a.v2ve") as recording:
-        times = recording.times_of_every(20_000)
+        times = recording.times_of_every(20_000, 4)
         pictures = recording.pictures_table["t_ns"].astype(np.int64)
         events = recording.between(-(2**62), 2**62)
         size = recording.head.height_px, recording.head.width_px

@@ -1,6 +1,6 @@
 """`v2v-prepare --videos-kind recordings`: raw recordings of any form, written in the form that is served.
 
-The destination mirrors the source: ``a/b.h5`` becomes ``a/b.h5.v2ve`` (:mod:`v2v_server.recorded.blocks`). A raw
+The destination mirrors the source: ``a/b.h5`` becomes ``a/b.h5.v2ve`` (:mod:`v2v_recordings.block_file`). A raw
 recording is read in a process that can only read, compute and write there, with a limit of memory, and of time by its
 size. A file has its final name once it is complete. A second run keeps the files whose sources have not changed.
 """
@@ -13,25 +13,13 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from v2v_protocol.errors import CorpusError, UsageError, VideoError
 from v2v_protocol.persisted import Persisted
-from v2v_protocol.write_aside import write_aside_and_rename
-from v2v_recordings.items import (
-    ConvertOptions,
-    EventChunk,
-    FlowField,
-    Item,
-    Light,
-    Note,
-    Picture,
-    SensorSize,
-)
-from v2v_recordings.ordered import InOrder
+from v2v_recordings.block_file import ENDING, EventFileWriter
+from v2v_recordings.items import ConvertOptions
 from v2v_recordings.reading import FORMS, read_items, recognise
 from v2v_recordings.text_events import TEXT_SUFFIXES
-from v2v_server.recorded.blocks import ENDING, LARGEST_SENSOR_SIDE_PX, EventFile, EventFileWriter, PackedEvents
+from v2v_server.store.event_file import EventFile
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.video.fingerprint import fingerprint, fingerprint_of
 
@@ -167,93 +155,33 @@ def convert_recording(job: Conversion) -> PreparedRecording:
     tempfile.tempdir = os.fspath(job.target.parent)  # the only place where this process may write
     try:
         name = fingerprint_of(dict(_sizes(job.source))) if job.source.is_dir() else fingerprint(job.source)
-        if (found := _standing(job, name)) is not None:
-            return found
-        with write_aside_and_rename(job.target, durable=True) as path:
-            with path.open("wb") as file:
-                write_items(EventFileWriter(file), read_items(job.source, None, ConvertOptions()), job.id, name)
-            return replace(_facts(job, path), is_kept=False)
+        if (found := _standing(job, name)) is None:
+            with EventFileWriter(job.target, source=job.id, fingerprint=name) as writer:
+                for item in read_items(job.source, None, ConvertOptions()):
+                    writer.add(item)
+            found = replace(_standing(job, name) or PreparedRecording(job.id), is_kept=False)
+        return found
     except (UsageError, VideoError) as error:
         more = "; v2v-convert takes such flags, and its .h5 states all that they do" if " --" in str(error) else ""
-        return PreparedRecording(job.id, problem=f"{error}{more}")
+        why = f"{error}{more}"
     except MemoryError:
-        return PreparedRecording(job.id, problem=f"reading it takes more than {MOST_MEMORY_BYTES >> 30} GiB of memory")
+        why = f"reading it takes more than {MOST_MEMORY_BYTES >> 30} GiB of memory"
     except OSError as error:
-        return PreparedRecording(job.id, problem=f"cannot be read or written: {error.strerror or error}")
+        why = f"cannot be read or written: {error.strerror or error}"
     except Exception as error:  # noqa: BLE001 - one strange file must not end the conversion of all others
-        return PreparedRecording(job.id, problem=f"converting failed: {type(error).__name__}: {error}")
+        why = f"converting failed: {type(error).__name__}: {error}"
+    return PreparedRecording(job.id, problem=why)
 
 
 def _standing(job: Conversion, name: str) -> PreparedRecording | None:
-    """Return the file of an earlier run if it was made from this source."""
+    """Return the file that was made from this source; None if there is none."""
     try:
         with EventFile(job.target) as events:
-            return _facts(job, job.target) if events.head.source == name else None
-    except VideoError:
+            head, size = events.head, job.target.stat().st_size
+            of = len(events.pictures_table), len(events.flows)
+    except (VideoError, OSError):
         return None
-
-
-def _facts(job: Conversion, path: Path) -> PreparedRecording:
-    with EventFile(path) as events:
-        head = events.head
-        return PreparedRecording(
-            job.id,
-            path.stat().st_size,
-            head.events,
-            len(events.pictures_table),
-            len(events.flows),
-            head.notes,
-            is_kept=True,
-        )
-
-
-def write_items(writer: EventFileWriter, items: Iterable[Item], name: str, source: str = "") -> None:
-    """Write the items of a reader, and finish the file. Times become nanoseconds since the first item.
-
-    Args:
-        name: of the recording, for messages.
-        source: fingerprint of the recording.
-
-    Raises:
-        UsageError: the recording has neither events nor pictures, or they do not fit together or into its sensor.
-    """
-    ordered, light, size, notes = InOrder(name), "", None, list[str]()
-    origin_ns: int | None = None
-
-    def add(chunks: Iterable[EventChunk]) -> None:
-        for chunk in chunks:
-            if max(chunk.x.max(), chunk.y.max()) >= LARGEST_SENSOR_SIDE_PX:
-                raise UsageError(
-                    f"{name}: events reach beyond {LARGEST_SENSOR_SIDE_PX} px, the largest side that is served"
-                )
-            writer.add(PackedEvents.of(chunk.t_ns - (origin_ns or 0), chunk.x, chunk.y, chunk.p))
-
-    for item in items:
-        if isinstance(item, EventChunk) and not len(item):
-            continue
-        if origin_ns is None and isinstance(item, EventChunk | Picture | FlowField):
-            origin_ns = int(np.ravel(item.t_ns)[0])
-        if isinstance(item, EventChunk):
-            add(ordered.add(item))
-        elif isinstance(item, Picture):
-            writer.add_picture(item.t_ns - (origin_ns or 0), item.pixels)
-        elif isinstance(item, FlowField):
-            writer.add_flow(item.t_ns - (origin_ns or 0), item.flow)
-        elif isinstance(item, SensorSize):
-            size = item.height, item.width
-        elif isinstance(item, Light):
-            light = item.name
-        elif isinstance(item, Note):
-            notes.append(item.text)
-    add(ordered.end())
-    if origin_ns is None:
-        raise UsageError(f"{name}: has no events")
-    height, width = size or writer.shape or writer.reach[::-1]
-    if max(height, width) > LARGEST_SENSOR_SIDE_PX:
-        raise UsageError(
-            f"{name}: a sensor of {width}x{height} px; the largest side that is served is {LARGEST_SENSOR_SIDE_PX}"
-        )
-    writer.finish(height, width, source, light, tuple(notes))
+    return PreparedRecording(job.id, size, head.events, *of, head.notes, is_kept=True) if head.source == name else None
 
 
 def summary(converted: Iterable[PreparedRecording], destination: os.PathLike[str] | str) -> list[str]:
