@@ -38,6 +38,7 @@ BENCHES = {
     "step": "speed.step",
     "evt3": "speed.evt3",
     "whole": "speed.whole",
+    "recorded": "speed.recorded",
     "physics": "accuracy.physics",
     "motion": "speed.motion",
     "substeps": "accuracy.substeps",

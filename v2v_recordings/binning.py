@@ -15,10 +15,28 @@ the same bytes.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
 DELTA_US = {"discrete": 1e-3, "interpolated": 1e-4}
+
+
+class EventsOfCrop(NamedTuple):
+    """The events of a time, in its order, and those of them in a crop.
+
+    Attributes:
+        t_ns: [n] int64, times of all.
+        inside: [m] int64, numbers of those in the crop.
+        pixel: [m] int64, their places in it, row by row.
+        brighter: [m] bool, their polarities.
+    """
+
+    t_ns: npt.NDArray[np.int64]
+    inside: npt.NDArray[np.int64]
+    pixel: npt.NDArray[np.int64]
+    brighter: npt.NDArray[np.bool_]
 
 
 def bin_events(

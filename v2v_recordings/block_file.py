@@ -5,10 +5,11 @@
     head                                        msgpack, see :class:`EventHead`, packed
     of the head: place, bytes, check, and bytes unpacked; magic     8 bytes each
 
-A block is up to :data:`MOST_BLOCK_EVENTS` consecutive events. Each is the time since the one before, uint32
-nanoseconds, x, and 2 y + polarity, uint16. They are sorted by the significance of the bytes, and compressed (zstd). So
-no time is rounded; a longer gap than 4.29 s begins another block. The head has a table for each of the three: when a
-piece begins, where it lies, and its check. Pieces are checked before they are unpacked, into a known number of bytes.
+A block is up to :data:`MOST_BLOCK_EVENTS` consecutive events. Each is the time since the one before, uint32, x, and 2 y
++ polarity, uint16. They are sorted by the significance of the bytes, and compressed (zstd). Times are in the largest
+unit, nanoseconds, that all steps of the block are multiples of. So no time is rounded; a longer gap than 4.29 s begins
+another block. The head has a table for each of the three: when a piece begins, where it lies, and its check. Pieces are
+checked before they are unpacked, into a known number of bytes.
 
 :mod:`v2v_server.store.event_file` reads it.
 """
@@ -35,8 +36,11 @@ ENDING = ".v2ve"
 FILE_MAGIC = b"V2VEVTS1"
 TAIL = struct.Struct("<QQQQ8s")
 _LONGEST_STEP_NS = 2**32 - 1
-TABLE = np.dtype([("t_ns", "<i8"), ("first", "<i8"), ("place", "<i8"), ("bytes", "<i8"), ("check", "<u8")])
-"""Of pieces: when one begins, the number of its first event, its first byte in the file, its size, and its hash."""
+TABLE = np.dtype(
+    [("t_ns", "<i8"), ("first", "<i8"), ("unit_ns", "<i8"), ("place", "<i8"), ("bytes", "<i8"), ("check", "<u8")]
+)
+"""Of pieces: when one begins, the number of its first event and the unit of its times; its first byte in the file, its
+size, and its hash."""
 NO_EVENTS = EventChunk(np.empty(0, np.int64), np.empty(0, np.uint16), np.empty(0, np.uint16), np.empty(0, bool))
 
 
@@ -85,10 +89,10 @@ class EventFileWriter(ItemWriter):
         self._at = self._file.write(FILE_MAGIC)
 
     def _write_picture(self, picture: Picture, t_ns: int) -> None:
-        self._write("pictures", t_ns, 0, np.ascontiguousarray(picture.pixels).tobytes())
+        self._write("pictures", t_ns, np.ascontiguousarray(picture.pixels).tobytes())
 
     def _write_flow(self, field: FlowField, t_ns: int) -> None:
-        self._write("flows", t_ns, 0, np.ascontiguousarray(field.flow, "<f4").tobytes())
+        self._write("flows", t_ns, np.ascontiguousarray(field.flow, "<f4").tobytes())
 
     def _write_events(self, events: EventChunk) -> None:
         joined = EventChunk.join((self._waiting, events))
@@ -102,15 +106,16 @@ class EventFileWriter(ItemWriter):
 
     def _write_block(self, events: EventChunk) -> None:
         steps = np.diff(events.t_ns, prepend=events.t_ns[:1])
+        unit_ns = max(1, int(np.gcd.reduce(steps)))
         words = events.x, 2 * events.y.astype(np.int64) + events.p
-        columns = [steps.astype("<u4"), *(word.astype("<u2") for word in words)]
-        rows = [column[:, None].view(np.uint8).T for column in columns]
-        self._write("blocks", int(events.t_ns[0]), self._packed_events, np.concatenate(rows).tobytes())
+        columns = [(steps // unit_ns).astype("<u4"), *(word.astype("<u2") for word in words)]
+        rows = np.concatenate([column[:, None].view(np.uint8).T for column in columns])
+        self._write("blocks", int(events.t_ns[0]), rows.tobytes(), self._packed_events, unit_ns)
         self._packed_events += len(events)
 
-    def _write(self, table: str, t_ns: int, first: int, data: bytes) -> None:
+    def _write(self, table: str, t_ns: int, data: bytes, first: int = 0, unit_ns: int = 0) -> None:
         packed = self._pack(data)
-        self._tables[table].append((t_ns, first, self._at, len(packed), xxhash.xxh3_64_intdigest(packed)))
+        self._tables[table].append((t_ns, first, unit_ns, self._at, len(packed), xxhash.xxh3_64_intdigest(packed)))
         self._at += self._file.write(packed)
 
     def _finish(self, written: Written) -> None:

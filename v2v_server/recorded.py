@@ -9,7 +9,8 @@ whole microseconds, rounded to even. Sums are rounded once, at the end.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,11 +18,9 @@ import numpy.typing as npt
 
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
-from v2v_recordings.binning import bin_events, bins_of, positions
-from v2v_recordings.items import EventChunk
+from v2v_recordings.binning import EventsOfCrop, bin_events, bins_of, positions
 from v2v_server.simulation import noise
 from v2v_server.simulation.pixel import hot_pixels, words
-from v2v_server.video.picture import PixelRect
 
 NOISE_RADIUS, NOISE_ANGLE = 1020, 1021
 """Purposes of the words of added noise (``noise.py``)."""
@@ -35,37 +34,33 @@ class Grids(NamedTuple):
 
 
 def fill_arrays(
-    events: EventChunk, grids: Grids, recipe: Recipe, params: SampleParams, window: PixelRect,
-    out: Mapping[str, npt.NDArray[Any]],
-) -> dict[str, int]:  # fmt: skip
+    events: EventsOfCrop, grids: Grids, recipe: Recipe, params: SampleParams, out: Mapping[str, npt.NDArray[Any]]
+) -> dict[str, int]:
     """Fill the requested arrays of a sample, and return how many values of each had to be clipped.
 
     Args:
         events: those from the first grid's begin to the last one's end.
         recipe, params: of the sample.
-        window: the crop in the picture of the sensor.
         out: arrays of :data:`v2v_protocol.sample.ARRAYS` made of events, by name, C-contiguous.
     """
-    top, left, height, width = window
-    # Unsigned: what is above or left of the crop wraps to large numbers.
-    x, y = events.x - np.uint16(left), events.y - np.uint16(top)
-    inside = np.flatnonzero((x < width) & (y < height))
-    shown, column = events.take(inside), x[inside].astype(np.int64)
-    pixel = y[inside] * np.int64(width) + (width - 1 - column if params.flip else column)
-    bounds = (np.searchsorted(each.t_ns, edges, "left") for each in (events, shown) for edges in grids)
-    latest = np.full((2, height * width), -np.inf)
-    clipped = dict.fromkeys(out, 0)
-    for grid, (first, last, start, end) in enumerate(zip(*map(np.ndarray.tolist, bounds), strict=True)):
+    pixels, clipped = recipe.crop_height_px * recipe.crop_width_px, dict.fromkeys(out, 0)
+    latest = np.full((2, pixels), -np.inf)
+    bounds = np.searchsorted(events.t_ns, np.stack(grids), "left")
+    parts = np.searchsorted(events.inside, bounds, "left")
+    for grid, (begin_ns, end_ns) in enumerate(np.stack(grids, 1).tolist()):
+        (first, last), part = bounds[:, grid].tolist(), slice(*parts[:, grid].tolist())
         spans_events = recipe.bin_span == "events" and first < last
-        begin_ns, end_ns = int(grids.begin_ns[grid]), int(grids.end_ns[grid])
         if spans_events:
             begin_ns, end_ns = int(events.t_ns[first]), int(events.t_ns[last - 1])
-        seen = _Seen(shown.part(start, end), pixel[start:end], begin_ns, end_ns, spans_events, recipe.bins, latest)
+        t_ns = events.t_ns[events.inside[part]]
+        seen = _Seen(
+            t_ns, events.pixel[part], events.brighter[part], begin_ns, end_ns, spans_events, recipe.bins, latest
+        )
         for name, target in out.items():
             clipped[name] += _store(_MAKERS[name](seen).reshape(target.shape[1:]), target[grid])
     if params.added:
         for name in out.keys() & {"voxels", "voxels_bilinear"}:
-            _add_noise(params, out[name].reshape(-1, height * width))
+            _add_noise(params, out[name].reshape(-1, pixels))
     return {name: count for name, count in clipped.items() if count}
 
 
@@ -73,13 +68,16 @@ class _Seen(NamedTuple):
     """The events of a grid in the crop.
 
     Attributes:
-        pixel: [n] places in the crop.
+        t_ns, pixel, brighter: [n] of each event, see :class:`EventsOfCrop`.
         begin_ns, end_ns: of the time that the bins divide.
+        spans_events: whether it is that from the first event to the last one, on the whole sensor.
+        bins: of a grid.
         latest: [2, pixels] time of the last event of each polarity, ns; -inf before the first one.
     """
 
-    events: EventChunk
+    t_ns: npt.NDArray[np.int64]
     pixel: npt.NDArray[np.int64]
+    brighter: npt.NDArray[np.bool_]
     begin_ns: int
     end_ns: int
     spans_events: bool
@@ -88,25 +86,18 @@ class _Seen(NamedTuple):
 
     def positions(self, kind: str) -> npt.NDArray[np.float64]:
         """Return where each event lies in the grid, [n], see :func:`v2v_recordings.binning.positions`."""
-        tau_us = np.rint((self.events.t_ns - self.begin_ns) / 1000)
-        length_us = float(np.rint((self.end_ns - self.begin_ns) / 1000))
-        return positions(kind, tau_us, length_us, spans_events=self.spans_events)
-
-    def sums(self, kind: str, polarity: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """Return the sums of the bins, [bins, pixels]."""
-        return bin_events(kind, self.positions(kind), self.pixel, polarity, self.bins, self.latest.shape[1])
+        tau_us, length_us = np.rint((self.t_ns - self.begin_ns) / 1000), np.rint((self.end_ns - self.begin_ns) / 1000)
+        return positions(kind, tau_us, float(length_us), spans_events=self.spans_events)
 
     def voxels(self, kind: str = "discrete") -> npt.NDArray[np.float64]:
         """Return the voxel grid, [bins, pixels]."""
-        return self.sums(kind, 2.0 * self.events.p - 1.0)
+        polarity = 2.0 * self.brighter - 1.0
+        return bin_events(kind, self.positions(kind), self.pixel, polarity, self.bins, self.latest.shape[1])
 
-    def bilinear(self) -> npt.NDArray[np.float64]:
-        """Return the interpolated grid, [bins, pixels]."""
-        return self.voxels("interpolated")
-
-    def counts(self) -> npt.NDArray[np.float64]:
+    def counts(self) -> npt.NDArray[np.int64]:
         """Return the events of each polarity, [2, bins, pixels]."""
-        return np.stack([self.sums("discrete", (self.events.p == polarity) * 1.0) for polarity in (False, True)])
+        cells = (self.brighter * self.bins + bins_of(self.positions("discrete"), self.bins)) * self.latest.shape[1]
+        return np.bincount(cells + self.pixel, minlength=self.bins * self.latest.size)
 
     def ages(self) -> npt.NDArray[np.float64]:
         """Return the ages of the last events at the ends of the bins, [2, bins, pixels] seconds."""
@@ -119,15 +110,15 @@ class _Seen(NamedTuple):
         for number, end in enumerate(ends.tolist()):
             part = slice(done, end)
             # Of several events of a pixel the last one stays.
-            self.latest[self.events.p[part].astype(np.intp), self.pixel[part]] = self.events.t_ns[part]
+            self.latest[self.brighter[part].astype(np.intp), self.pixel[part]] = self.t_ns[part]
             ages[:, number] = np.maximum(self.begin_ns + (number + 1) * bin_ns - self.latest, 0.0) * 1e-9
             done = end
         return ages
 
 
-_MAKERS = {
+_MAKERS: Mapping[str, Callable[[_Seen], npt.NDArray[Any]]] = {
     "voxels": _Seen.voxels,
-    "voxels_bilinear": _Seen.bilinear,
+    "voxels_bilinear": partial(_Seen.voxels, kind="interpolated"),
     "event_counts": _Seen.counts,
     "time_surface": _Seen.ages,
 }
@@ -135,10 +126,12 @@ _MAKERS = {
 
 def _store(values: npt.NDArray[Any], target: npt.NDArray[Any]) -> int:
     """Store values as the dtype of the target, clipped to what it holds; return how many were clipped."""
-    is_whole = target.dtype.kind == "i"
-    most = float(np.iinfo(target.dtype).max if is_whole else np.finfo(target.dtype).max)
-    beyond = int(np.count_nonzero((np.abs(values) > most) & np.isfinite(values)))
-    target[...] = np.clip(values, -most, most) if beyond else values
+    limits = np.iinfo(target.dtype) if target.dtype.kind == "i" else np.finfo(target.dtype)
+    most, beyond = float(limits.max), 0
+    if not -most <= values.min() <= values.max() <= most:
+        is_beyond = (np.abs(values) > most) & np.isfinite(values)
+        values, beyond = np.where(is_beyond, np.clip(values, -most, most), values), int(np.count_nonzero(is_beyond))
+    target[...] = values
     return beyond
 
 

@@ -46,14 +46,15 @@ def test_every_raw_form_gives_the_known_voxel_grids(case: str, prepared: Path) -
     original, has_pictures = scene(), case in WITH_PICTURES
     (path,) = (prepared / case).rglob("*.v2ve")
     with EventFile(path) as recording:
-        events = recording.between(-(2**62), 2**62)
-        for name in ("x", "y", "p"):
-            assert np.array_equal(getattr(events, name), getattr(original, name)), name
+        size = recording.head.height_px, recording.head.width_px
+        events = recording.between(-(2**62), 2**62, (0, 0, *size))
+        assert np.array_equal(events.pixel, original.y.astype(int) * size[1] + original.x)
+        assert np.array_equal(events.brighter, original.p)
         assert np.array_equal(np.diff(events.t_ns), 1000 * np.diff(original.t_us))
         assert len(recording.pictures_table) == (WINDOWS + 1 if has_pictures else 0)
         if not has_pictures:
             return
-        assert (recording.head.height_px, recording.head.width_px) == (HEIGHT, WIDTH)
+        assert size == (HEIGHT, WIDTH)
         edges = recording.pictures_table["t_ns"].astype(np.int64)
         assert np.diff(edges).tolist() == [1000 * PERIOD_US] * WINDOWS
         for number, picture in enumerate(original.pictures):
@@ -64,7 +65,7 @@ def test_every_raw_form_gives_the_known_voxel_grids(case: str, prepared: Path) -
         recipe, seed=0, epoch=0, index=0, picture_height_px=HEIGHT, picture_width_px=WIDTH, video_id=""
     )  # fmt: skip
     out = new_arrays(array_layout(recipe, "float32", ("voxels", "voxels_bilinear")))
-    fill_arrays(events, Grids(edges[:-1], edges[1:]), recipe, params, (0, 0, HEIGHT, WIDTH), out)
+    fill_arrays(events, Grids(edges[:-1], edges[1:]), recipe, params, out)
     for window in range(WINDOWS):
         assert np.array_equal(out["voxels"][window], expected_voxels(window, "discrete"))
         assert np.allclose(out["voxels_bilinear"][window], expected_voxels(window, "interpolated"), rtol=0, atol=1e-6)

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from trainer.evaluation import voxelise
 from v2v_protocol.recipe import Recipe, preset
 from v2v_protocol.sample import SampleParams, array_layout, new_arrays
+from v2v_recordings.binning import EventsOfCrop
 from v2v_recordings.block_file import NO_EVENTS, EventFileWriter
 from v2v_recordings.items import ConvertOptions, EventChunk
 from v2v_recordings.reading import read_items
@@ -47,17 +48,22 @@ def events_of(t_ns: npt.ArrayLike, *columns: npt.ArrayLike) -> EventChunk:
     return EventChunk(np.asarray(t_ns, np.int64), x.astype(np.uint16), y.astype(np.uint16), p.astype(bool))
 
 
+def cropped(events: EventChunk, window: tuple[int, int, int, int], flip: bool) -> EventsOfCrop:
+    top, left, height, width = window
+    x, y = events.x.astype(int) - left, events.y.astype(int) - top
+    inside = np.flatnonzero((x >= 0) & (x < width) & (y >= 0) & (y < height))
+    pixel = y * width + (width - 1 - x if flip else x)
+    return EventsOfCrop(events.t_ns, inside, pixel[inside], events.p[inside])
+
+
 def made(
     events: EventChunk, edges: npt.NDArray[np.int64], recipe: Recipe, dtype: str = "float32",
     window: tuple[int, int, int, int] | None = None, params: SampleParams | None = None,
 ) -> tuple[dict[str, Any], dict[str, int]]:  # fmt: skip
     recipe = recipe.replace(voxels_per_clip=len(edges) - 1)
-    out = new_arrays(array_layout(recipe, dtype, ALL))
-    clipped = fill_arrays(
-        events, Grids(edges[:-1], edges[1:]), recipe, params or params_of(recipe),
-        window or (0, 0, *recipe.crop_px), out,
-    )  # fmt: skip
-    return out, clipped
+    out, drawn = new_arrays(array_layout(recipe, dtype, ALL)), params or params_of(recipe)
+    crop = cropped(events, window or (0, 0, *recipe.crop_px), drawn.flip)
+    return out, fill_arrays(crop, Grids(edges[:-1], edges[1:]), recipe, drawn, out)
 
 
 def evaluated(
@@ -166,8 +172,10 @@ def test_real_recordings_give_the_grids_of_evaluation(name: str, tmp_path: Path)
     with EventFile(tmp_path / "a.v2ve") as recording:
         times = recording.times_of_every(20_000, 4)
         pictures = recording.pictures_table["t_ns"].astype(np.int64)
-        events = recording.between(-(2**62), 2**62)
         size = recording.head.height_px, recording.head.width_px
+        found = recording.between(-(2**62), 2**62, (0, 0, *size))
+    assert len(found.inside) == len(found.t_ns)
+    events = events_of(found.t_ns, found.pixel % size[1], found.pixel // size[1], found.brighter)
     for edges in filter(lambda each: len(each) > 1, (times[:4], pictures[:4])):
         whole_us = 1000 * np.rint(edges / 1000).astype(np.int64)
         assert_as_evaluated(events, whole_us, size, 5)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from contextlib import AbstractContextManager
+from itertools import pairwise
 from types import TracebackType
 from typing import Any
 
@@ -16,12 +17,13 @@ import numpy.typing as npt
 import xxhash
 
 from v2v_protocol.errors import ProtocolError, UsageError, VideoError, VideoUnreadable
-from v2v_recordings.block_file import FILE_MAGIC, MOST_BLOCK_EVENTS, NO_EVENTS, TABLE, TAIL, EventHead
-from v2v_recordings.items import EventChunk
+from v2v_recordings.binning import EventsOfCrop
+from v2v_recordings.block_file import FILE_MAGIC, MOST_BLOCK_EVENTS, TABLE, TAIL, EventHead
 from v2v_server.store.format import Bytes, UnpackingError, unpack
+from v2v_server.video.picture import PixelRect
 
 MOST_SAMPLE_EVENTS = 1 << 25
-"""Events that are taken at once, for one sample; they need 13 bytes each."""
+"""Events that are taken at once, for one sample; they need 25 bytes each."""
 _LARGEST_HEAD_BYTES = 256 << 20
 _REMEDY = "prepare the recording again with v2v-prepare --videos-kind recordings"
 
@@ -70,23 +72,61 @@ class EventFile(AbstractContextManager["EventFile"]):
         if self._firsts[0] != 0 or (len(counts) and not 0 < counts.min() <= counts.max() <= MOST_BLOCK_EVENTS):
             raise self._damaged("its blocks do not follow each other")
 
-    def between(self, begin_ns: int, end_ns: int) -> EventChunk:
-        """Return the events with ``begin_ns <= t < end_ns``."""
+    def between(self, begin_ns: int, end_ns: int, window: PixelRect, is_flipped: bool = False) -> EventsOfCrop:
+        """Return the events with ``begin_ns <= t < end_ns`` and those in a crop.
+
+        Args:
+            window: the crop in the picture of the sensor.
+            is_flipped: whether columns are counted from the right of the crop.
+
+        Raises:
+            VideoError: there are more than MOST_SAMPLE_EVENTS; or see the class.
+        """
+        from v2v_server.store.event_blocks import unpack_block  # lazily: a catalogue must not load numba
+
         first, last = np.searchsorted(self.blocks["t_ns"], (begin_ns, end_ns), "left").tolist()
         # Events at the very time at which a block begins may be in those before it.
         first = max(0, first - 1)
-        found = self._events(first, max(first, last))
-        return found.part(*np.searchsorted(found.t_ns, (begin_ns, end_ns), "left").tolist())
+        bounds = (self._firsts[first : max(first, last) + 1] - self._firsts[first]).tolist()
+        if bounds[-1] > MOST_SAMPLE_EVENTS:
+            raise VideoError(
+                self._path,
+                None,
+                f"a sample takes {bounds[-1]:,} events; at most {MOST_SAMPLE_EVENTS:,}: give closer marks (--rate, "
+                "--marks 20000events), or fewer voxels_per_clip",
+            )
+        t_ns, kept = np.empty(bounds[-1], np.int64), 0
+        inside, pixel, brighter = np.empty_like(t_ns), np.empty_like(t_ns), np.empty(len(t_ns), bool)
+        for number, (start, end) in enumerate(pairwise(bounds), first):
+            record = self.blocks[number]
+            kept += unpack_block(
+                self._rows(number), start, record["t_ns"], record["unit_ns"], window, is_flipped, t_ns[start:end],
+                inside[kept:], pixel[kept:], brighter[kept:],
+            )  # fmt: skip
+        low, high = np.searchsorted(t_ns, (begin_ns, end_ns), "left").tolist()
+        part = slice(*np.searchsorted(inside[:kept], (low, high)).tolist())
+        return EventsOfCrop(t_ns[low:high], inside[part] - low, pixel[part], brighter[part])
 
     def times_of_every(self, events: int, most: int) -> npt.NDArray[np.int64]:
         """Return the times of the first of all events and of each ``events`` further, [n] ns, ``most`` at most."""
         wanted = np.arange(0, min(self.head.events, events * most), events)
         numbers, at = np.unique(np.searchsorted(self._firsts, wanted, "right") - 1, return_index=True)
         times = [
-            self._events(number, number + 1).t_ns[part - self._firsts[number]]
+            self._times(number)[part - self._firsts[number]]
             for number, part in zip(numbers.tolist(), np.split(wanted, at[1:]), strict=False)
         ]
-        return np.concatenate([NO_EVENTS.t_ns, *times])
+        return np.concatenate([np.empty(0, np.int64), *times])
+
+    def _times(self, number: int) -> npt.NDArray[np.int64]:
+        rows, record = self._rows(number)[:4].astype(np.int64), self.blocks[number]
+        steps = rows[0] + (rows[1] << 8) + (rows[2] << 16) + (rows[3] << 24)
+        times: npt.NDArray[np.int64] = record["t_ns"] + record["unit_ns"] * np.cumsum(steps)
+        return times
+
+    def _rows(self, number: int) -> npt.NDArray[np.uint8]:
+        """Return a block, [8, n]."""
+        count = int(self._firsts[number + 1] - self._firsts[number])
+        return np.frombuffer(self._piece(self.blocks[number], 8 * count), np.uint8).reshape(8, count)
 
     def picture(self, number: int) -> npt.NDArray[np.uint8]:
         """Return a picture, [H, W]."""
@@ -97,26 +137,6 @@ class EventFile(AbstractContextManager["EventFile"]):
         """Return a field of flow to the next one, [2, H, W] px; NaN where it is not known."""
         shape = 2, self.head.height_px, self.head.width_px
         return np.frombuffer(self._piece(self.flows[number], 8 * shape[1] * shape[2]), "<f4").reshape(shape)
-
-    def _events(self, first: int, last: int) -> EventChunk:
-        """Return the events of blocks ``first`` to ``last`` - 1."""
-        bounds = self._firsts[first : last + 1] - self._firsts[first]
-        if bounds[-1] > MOST_SAMPLE_EVENTS:
-            raise VideoError(
-                self._path,
-                None,
-                f"a sample takes {bounds[-1]:,} events; at most {MOST_SAMPLE_EVENTS:,}: give closer marks (--rate, --marks "
-                "20000events), or fewer voxels_per_clip",
-            )
-        t_ns = np.empty(bounds[-1], np.int64)
-        x, y_and_p = np.empty(len(t_ns), np.uint16), np.empty(len(t_ns), np.uint16)
-        for number, (start, end) in enumerate(zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True), first):
-            record, part = self.blocks[number], slice(start, end)
-            rows = np.frombuffer(self._piece(record, 8 * (end - start)), np.uint8).reshape(8, -1)
-            x[part], y_and_p[part] = _joined(rows[4:6], np.uint16), _joined(rows[6:], np.uint16)
-            np.cumsum(_joined(rows[:4], np.uint32), dtype=np.int64, out=t_ns[part])
-            t_ns[part] += record["t_ns"]
-        return EventChunk(t_ns, x, y_and_p >> 1, (y_and_p & 1).astype(bool))
 
     def _piece(self, record: Any, size: int) -> Bytes:
         """Return a piece, unpacked to this size."""
@@ -146,11 +166,3 @@ class EventFile(AbstractContextManager["EventFile"]):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         os.close(self._file)
-
-
-def _joined(rows: npt.NDArray[np.uint8], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-    """Return numbers [n] of their bytes [size, n], the lowest first."""
-    values = rows[0].astype(dtype)
-    for number, row in enumerate(rows[1:], 1):
-        values |= row.astype(dtype) << (8 * number)
-    return values

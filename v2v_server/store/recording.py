@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.sample import ARRAYS, RECORDING_FORMAT, array_layout, new_arrays
-from v2v_recordings.block_file import NO_EVENTS
 from v2v_server.store.event_file import EventFile
 from v2v_server.video.decode import ClipRequest, Cut, DecodedClip, DecodedPicture, SampleView
 from v2v_server.video.fingerprint import check_fingerprint
@@ -132,8 +131,10 @@ class RecordedPixels(EventFile):
         of_events = tuple(name for name in view.arrays if ARRAYS[name].of_events is not None)
         asked = of_events, tuple(name for name in _FLOW if name in view.arrays and len(self.flows))
         arrays = new_arrays(array_layout(recipe, view.spec.voxel_dtype, asked[0] + asked[1]))
-        events = self.between(int(edges[0]), int(edges[-1])) if of_events else NO_EVENTS
-        saturated = fill_arrays(events, grids, recipe, params, window, {name: arrays[name] for name in of_events})
+        saturated = dict[str, int]()
+        if of_events:
+            events = self.between(int(edges[0]), int(edges[-1]), window, params.flip)
+            saturated = fill_arrays(events, grids, recipe, params, {name: arrays[name] for name in of_events})
         if asked[1]:
             why = self._fill_flow(edges[recipe.lead_voxels :], window, view, {name: arrays[name] for name in asked[1]})
         elif not np.isin(edges, self.pictures_table["t_ns"]).all():
