@@ -23,20 +23,23 @@ import numpy.typing as npt
 DELTA_US = {"discrete": 1e-3, "interpolated": 1e-4}
 
 
+NEVER = np.iinfo(np.int64).min
+
+
 class EventsOfCrop(NamedTuple):
-    """The events of a time, in its order, and those of them in a crop.
+    """The events of some grids in a crop.
 
     Attributes:
-        t_ns: [n] int64, times of all.
-        inside: [m] int64, numbers of those in the crop.
-        pixel: [m] int64, their places in it, row by row.
-        brighter: [m] bool, their polarities.
+        t_ns: [n] int64, ascending.
+        pixel: [n] int64, places in the crop, row by row.
+        brighter: [n] bool, polarities.
+        span_ns: [grids, 2] int64, times of the first and last event of each grid on the whole sensor; NEVER without.
     """
 
     t_ns: npt.NDArray[np.int64]
-    inside: npt.NDArray[np.int64]
     pixel: npt.NDArray[np.int64]
     brighter: npt.NDArray[np.bool_]
+    span_ns: npt.NDArray[np.int64]
 
 
 def bin_events(

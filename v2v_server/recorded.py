@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ import numpy.typing as npt
 
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
-from v2v_recordings.binning import EventsOfCrop, bin_events, bins_of, positions
+from v2v_recordings.binning import NEVER, EventsOfCrop, bin_events, bins_of, positions
 from v2v_server.simulation import noise
 from v2v_server.simulation.pixel import hot_pixels, words
 
@@ -26,36 +27,27 @@ NOISE_RADIUS, NOISE_ANGLE = 1020, 1021
 """Purposes of the words of added noise (``noise.py``)."""
 
 
-class Grids(NamedTuple):
-    """When the voxel grids of a sample begin and end, [G] int64 nanoseconds each; a paused one is empty."""
-
-    begin_ns: npt.NDArray[np.int64]
-    end_ns: npt.NDArray[np.int64]
-
-
 def fill_arrays(
-    events: EventsOfCrop, grids: Grids, recipe: Recipe, params: SampleParams, out: Mapping[str, npt.NDArray[Any]]
-) -> dict[str, int]:
+    events: EventsOfCrop, edges_ns: npt.NDArray[np.int64], recipe: Recipe, params: SampleParams,
+    out: Mapping[str, npt.NDArray[Any]],
+) -> dict[str, int]:  # fmt: skip
     """Fill the requested arrays of a sample, and return how many values of each had to be clipped.
 
     Args:
-        events: those from the first grid's begin to the last one's end.
+        events: of the grids.
+        edges_ns: [grids + 1] where these begin and end; a paused one is empty.
         recipe, params: of the sample.
         out: arrays of :data:`v2v_protocol.sample.ARRAYS` made of events, by name, C-contiguous.
     """
     pixels, clipped = recipe.crop_height_px * recipe.crop_width_px, dict.fromkeys(out, 0)
     latest = np.full((2, pixels), -np.inf)
-    bounds = np.searchsorted(events.t_ns, np.stack(grids), "left")
-    parts = np.searchsorted(events.inside, bounds, "left")
-    for grid, (begin_ns, end_ns) in enumerate(np.stack(grids, 1).tolist()):
-        (first, last), part = bounds[:, grid].tolist(), slice(*parts[:, grid].tolist())
-        spans_events = recipe.bin_span == "events" and first < last
-        if spans_events:
-            begin_ns, end_ns = int(events.t_ns[first]), int(events.t_ns[last - 1])
-        t_ns = events.t_ns[events.inside[part]]
-        seen = _Seen(
-            t_ns, events.pixel[part], events.brighter[part], begin_ns, end_ns, spans_events, recipe.bins, latest
-        )
+    parts = np.searchsorted(events.t_ns, edges_ns, "left").tolist()
+    for grid, (times_ns, span_ns) in enumerate(zip(pairwise(edges_ns.tolist()), events.span_ns.tolist(), strict=True)):
+        part = slice(parts[grid], parts[grid + 1])
+        spans_events = recipe.bin_span == "events" and span_ns[0] != NEVER
+        begin_ns, end_ns = span_ns if spans_events else times_ns
+        columns = (column[part] for column in (events.t_ns, events.pixel, events.brighter))
+        seen = _Seen(*columns, begin_ns, end_ns, spans_events, recipe.bins, latest)
         for name, target in out.items():
             clipped[name] += _store(_MAKERS[name](seen).reshape(target.shape[1:]), target[grid])
     if params.added:

@@ -22,7 +22,7 @@ from v2v_recordings.layout_writer import RecordingWriter
 from v2v_server import prepare_recordings
 from v2v_server.commands import prepare
 from v2v_server.prepare_recordings import convert_recordings
-from v2v_server.recorded import Grids, fill_arrays
+from v2v_server.recorded import fill_arrays
 from v2v_server.simulation.draw import draw
 from v2v_server.store.event_file import EventFile
 
@@ -47,7 +47,7 @@ def test_every_raw_form_gives_the_known_voxel_grids(case: str, prepared: Path) -
     (path,) = (prepared / case).rglob("*.v2ve")
     with EventFile(path) as recording:
         size = recording.head.height_px, recording.head.width_px
-        events = recording.between(-(2**62), 2**62, (0, 0, *size))
+        events = recording.between(np.array([-(2**62), 2**62]), (0, 0, *size))
         assert np.array_equal(events.pixel, original.y.astype(int) * size[1] + original.x)
         assert np.array_equal(events.brighter, original.p)
         assert np.array_equal(np.diff(events.t_ns), 1000 * np.diff(original.t_us))
@@ -56,6 +56,7 @@ def test_every_raw_form_gives_the_known_voxel_grids(case: str, prepared: Path) -
             return
         assert size == (HEIGHT, WIDTH)
         edges = recording.pictures_table["t_ns"].astype(np.int64)
+        events = recording.between(edges, (0, 0, *size))
         assert np.diff(edges).tolist() == [1000 * PERIOD_US] * WINDOWS
         for number, picture in enumerate(original.pictures):
             assert np.array_equal(recording.picture(number), picture)
@@ -65,7 +66,7 @@ def test_every_raw_form_gives_the_known_voxel_grids(case: str, prepared: Path) -
         recipe, seed=0, epoch=0, index=0, picture_height_px=HEIGHT, picture_width_px=WIDTH, video_id=""
     )  # fmt: skip
     out = new_arrays(array_layout(recipe, "float32", ("voxels", "voxels_bilinear")))
-    fill_arrays(events, Grids(edges[:-1], edges[1:]), recipe, params, out)
+    fill_arrays(events, edges, recipe, params, out)
     for window in range(WINDOWS):
         assert np.array_equal(out["voxels"][window], expected_voxels(window, "discrete"))
         assert np.allclose(out["voxels_bilinear"][window], expected_voxels(window, "interpolated"), rtol=0, atol=1e-6)

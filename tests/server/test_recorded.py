@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 from trainer.evaluation import voxelise
 from v2v_protocol.recipe import Recipe, preset
 from v2v_protocol.sample import SampleParams, array_layout, new_arrays
-from v2v_recordings.binning import EventsOfCrop
+from v2v_recordings.binning import NEVER, EventsOfCrop
 from v2v_recordings.block_file import NO_EVENTS, EventFileWriter
 from v2v_recordings.items import ConvertOptions, EventChunk
 from v2v_recordings.reading import read_items
-from v2v_server.recorded import Grids, fill_arrays
+from v2v_server.recorded import fill_arrays
 from v2v_server.simulation.draw import draw
 from v2v_server.store.event_file import EventFile
 
@@ -48,12 +48,17 @@ def events_of(t_ns: npt.ArrayLike, *columns: npt.ArrayLike) -> EventChunk:
     return EventChunk(np.asarray(t_ns, np.int64), x.astype(np.uint16), y.astype(np.uint16), p.astype(bool))
 
 
-def cropped(events: EventChunk, window: tuple[int, int, int, int], flip: bool) -> EventsOfCrop:
+def cropped(
+    events: EventChunk, edges: npt.NDArray[np.int64], window: tuple[int, int, int, int], flip: bool
+) -> EventsOfCrop:
     top, left, height, width = window
     x, y = events.x.astype(int) - left, events.y.astype(int) - top
-    inside = np.flatnonzero((x >= 0) & (x < width) & (y >= 0) & (y < height))
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    inside &= (events.t_ns >= edges[0]) & (events.t_ns < edges[-1])
     pixel = y * width + (width - 1 - x if flip else x)
-    return EventsOfCrop(events.t_ns, inside, pixel[inside], events.p[inside])
+    grids = [events.t_ns[(events.t_ns >= begin) & (events.t_ns < end)].tolist() for begin, end in pairwise(edges)]
+    span = np.array([(each[0], each[-1]) if each else (NEVER, NEVER) for each in grids])
+    return EventsOfCrop(events.t_ns[inside], pixel[inside], events.p[inside], span)
 
 
 def made(
@@ -62,8 +67,8 @@ def made(
 ) -> tuple[dict[str, Any], dict[str, int]]:  # fmt: skip
     recipe = recipe.replace(voxels_per_clip=len(edges) - 1)
     out, drawn = new_arrays(array_layout(recipe, dtype, ALL)), params or params_of(recipe)
-    crop = cropped(events, window or (0, 0, *recipe.crop_px), drawn.flip)
-    return out, fill_arrays(crop, Grids(edges[:-1], edges[1:]), recipe, drawn, out)
+    crop = cropped(events, edges, window or (0, 0, *recipe.crop_px), drawn.flip)
+    return out, fill_arrays(crop, edges, recipe, drawn, out)
 
 
 def evaluated(
@@ -173,8 +178,8 @@ def test_real_recordings_give_the_grids_of_evaluation(name: str, tmp_path: Path)
         times = recording.times_of_every(20_000, 4)
         pictures = recording.pictures_table["t_ns"].astype(np.int64)
         size = recording.head.height_px, recording.head.width_px
-        found = recording.between(-(2**62), 2**62, (0, 0, *size))
-    assert len(found.inside) == len(found.t_ns)
+        found = recording.between(np.array([-(2**62), 2**62]), (0, 0, *size))
+    assert len(found.t_ns) == recording.head.events
     events = events_of(found.t_ns, found.pixel % size[1], found.pixel // size[1], found.brighter)
     for edges in filter(lambda each: len(each) > 1, (times[:4], pictures[:4])):
         whole_us = 1000 * np.rint(edges / 1000).astype(np.int64)

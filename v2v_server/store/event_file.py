@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 from contextlib import AbstractContextManager
-from itertools import pairwise
 from types import TracebackType
 from typing import Any
 
@@ -17,13 +16,13 @@ import numpy.typing as npt
 import xxhash
 
 from v2v_protocol.errors import ProtocolError, UsageError, VideoError, VideoUnreadable
-from v2v_recordings.binning import EventsOfCrop
+from v2v_recordings.binning import NEVER, EventsOfCrop
 from v2v_recordings.block_file import FILE_MAGIC, MOST_BLOCK_EVENTS, TABLE, TAIL, EventHead
 from v2v_server.store.format import Bytes, UnpackingError, unpack
 from v2v_server.video.picture import PixelRect
 
 MOST_SAMPLE_EVENTS = 1 << 25
-"""Events that are taken at once, for one sample; they need 25 bytes each."""
+"""Events that are taken at once, for one sample; they need 17 bytes each."""
 _LARGEST_HEAD_BYTES = 256 << 20
 _REMEDY = "prepare the recording again with v2v-prepare --videos-kind recordings"
 
@@ -72,10 +71,11 @@ class EventFile(AbstractContextManager["EventFile"]):
         if self._firsts[0] != 0 or (len(counts) and not 0 < counts.min() <= counts.max() <= MOST_BLOCK_EVENTS):
             raise self._damaged("its blocks do not follow each other")
 
-    def between(self, begin_ns: int, end_ns: int, window: PixelRect, is_flipped: bool = False) -> EventsOfCrop:
-        """Return the events with ``begin_ns <= t < end_ns`` and those in a crop.
+    def between(self, edges_ns: npt.NDArray[np.int64], window: PixelRect, is_flipped: bool = False) -> EventsOfCrop:
+        """Return the events of a crop in grids that follow each other, and when the events of each grid are.
 
         Args:
+            edges_ns: [grids + 1] where they begin and end, ascending: a grid has the events with begin <= t < end.
             window: the crop in the picture of the sensor.
             is_flipped: whether columns are counted from the right of the crop.
 
@@ -84,28 +84,26 @@ class EventFile(AbstractContextManager["EventFile"]):
         """
         from v2v_server.store.event_blocks import unpack_block  # lazily: a catalogue must not load numba
 
-        first, last = np.searchsorted(self.blocks["t_ns"], (begin_ns, end_ns), "left").tolist()
+        first, last = np.searchsorted(self.blocks["t_ns"], edges_ns[[0, -1]], "left").tolist()
         # Events at the very time at which a block begins may be in those before it.
         first = max(0, first - 1)
-        bounds = (self._firsts[first : max(first, last) + 1] - self._firsts[first]).tolist()
-        if bounds[-1] > MOST_SAMPLE_EVENTS:
+        count, kept = int(self._firsts[max(first, last)] - self._firsts[first]), 0
+        if count > MOST_SAMPLE_EVENTS:
             raise VideoError(
                 self._path,
                 None,
-                f"a sample takes {bounds[-1]:,} events; at most {MOST_SAMPLE_EVENTS:,}: give closer marks (--rate, "
+                f"a sample takes {count:,} events; at most {MOST_SAMPLE_EVENTS:,}: give closer marks (--rate, "
                 "--marks 20000events), or fewer voxels_per_clip",
             )
-        t_ns, kept = np.empty(bounds[-1], np.int64), 0
-        inside, pixel, brighter = np.empty_like(t_ns), np.empty_like(t_ns), np.empty(len(t_ns), bool)
-        for number, (start, end) in enumerate(pairwise(bounds), first):
+        span_ns, times = np.full((len(edges_ns) - 1, 2), NEVER), np.empty(MOST_BLOCK_EVENTS, np.int64)
+        t_ns, pixel, brighter = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, bool)
+        for number in range(first, last):
             record = self.blocks[number]
             kept += unpack_block(
-                self._rows(number), start, record["t_ns"], record["unit_ns"], window, is_flipped, t_ns[start:end],
-                inside[kept:], pixel[kept:], brighter[kept:],
+                self._rows(number), record["t_ns"], record["unit_ns"], edges_ns, window, is_flipped, times, span_ns,
+                t_ns[kept:], pixel[kept:], brighter[kept:],
             )  # fmt: skip
-        low, high = np.searchsorted(t_ns, (begin_ns, end_ns), "left").tolist()
-        part = slice(*np.searchsorted(inside[:kept], (low, high)).tolist())
-        return EventsOfCrop(t_ns[low:high], inside[part] - low, pixel[part], brighter[part])
+        return EventsOfCrop(t_ns[:kept], pixel[:kept], brighter[:kept], span_ns)
 
     def times_of_every(self, events: int, most: int) -> npt.NDArray[np.int64]:
         """Return the times of the first of all events and of each ``events`` further, [n] ns, ``most`` at most."""

@@ -119,21 +119,21 @@ class RecordedPixels(EventFile):
         self, clip: DecodedClip, times: npt.NDArray[np.int64], usable: PixelRect, view: SampleView
     ) -> DecodedClip:
         """Return a clip with the arrays of a sample that are made of events, and true flow; ``times``: [n] marks."""
-        from v2v_server.recorded import Grids, fill_arrays  # a catalogue must not load numba
+        from v2v_server.recorded import fill_arrays  # a catalogue must not load numba
 
         recipe, params = view.spec.recipe, view.params
         ends = params.ends(recipe)
         edges = times[params.source_index(int(ends[-1]))[ends]]
         window = usable[0] + params.crop_top_px, usable[1] + params.crop_left_px, *recipe.crop_px
-        parts = np.arange(max(1, recipe.grids_per_frame) + 1)
+        parts = np.arange(1, max(1, recipe.grids_per_frame) + 1)
         inner = edges[:-1, None] + np.diff(edges)[:, None] * parts // parts[-1]
-        grids = Grids(inner[:, :-1].ravel(), inner[:, 1:].ravel())
+        grids = np.append(edges[:1], inner)
         of_events = tuple(name for name in view.arrays if ARRAYS[name].of_events is not None)
         asked = of_events, tuple(name for name in _FLOW if name in view.arrays and len(self.flows))
         arrays = new_arrays(array_layout(recipe, view.spec.voxel_dtype, asked[0] + asked[1]))
         saturated = dict[str, int]()
         if of_events:
-            events = self.between(int(edges[0]), int(edges[-1]), window, params.flip)
+            events = self.between(grids, window, params.flip)
             saturated = fill_arrays(events, grids, recipe, params, {name: arrays[name] for name in of_events})
         if asked[1]:
             why = self._fill_flow(edges[recipe.lead_voxels :], window, view, {name: arrays[name] for name in asked[1]})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from hypothesis import strategies as st
 
 from v2v_protocol.errors import UsageError, VideoError, VideoUnreadable
 from v2v_recordings import block_file, item_writer
-from v2v_recordings.binning import EventsOfCrop
+from v2v_recordings.binning import NEVER, EventsOfCrop
 from v2v_recordings.block_file import NO_EVENTS, TABLE, TAIL, EventFileWriter
 from v2v_recordings.items import EventChunk, FlowField, Light, Note, Picture, SensorSize
 from v2v_server.store import event_file
@@ -41,8 +42,7 @@ WHOLE = 0, 0, 40, 50
 
 
 def columns(found: EventsOfCrop, width: int = 50) -> list[list[int]]:
-    times = found.t_ns[found.inside]
-    return [each.tolist() for each in (times, found.pixel % width, found.pixel // width, found.brighter)]
+    return [each.tolist() for each in (found.t_ns, found.pixel % width, found.pixel // width, found.brighter)]
 
 
 @st.composite
@@ -71,17 +71,19 @@ def test_events_are_found_by_time_and_the_times_of_every_n_th(
         whole = EventChunk.join([NO_EVENTS, *parts])
         moments = st.sampled_from([*whole.t_ns.tolist(), 0]).flatmap(lambda t: st.integers(t - 2, t + 2))
         with EventFile(path) as file:
-            begin, end = sorted((data.draw(moments), data.draw(moments)))
-            kept = np.flatnonzero((whole.t_ns >= begin) & (whole.t_ns < end))
+            edges = np.sort(np.array(data.draw(st.lists(moments, min_size=2, max_size=5))))
             height, width = data.draw(st.integers(1, 40)), data.draw(st.integers(1, 50))
             top, left = data.draw(st.integers(0, 40 - height)), data.draw(st.integers(0, 50 - width))
             flip = data.draw(st.booleans())
-            found = file.between(begin, end, (top, left, height, width), flip)
-            assert found.t_ns.tolist() == whole.t_ns[kept].tolist()
+            found = file.between(edges, (top, left, height, width), flip)
+            for (first, last), (begin, end) in zip(found.span_ns.tolist(), pairwise(edges), strict=True):
+                of_grid = whole.t_ns[(whole.t_ns >= begin) & (whole.t_ns < end)].tolist()
+                assert (first, last) == ((of_grid[0], of_grid[-1]) if of_grid else (NEVER, NEVER))
             x, y = whole.x.astype(int) - left, whole.y.astype(int) - top
-            shown = whole.take(kept[((x >= 0) & (x < width) & (y >= 0) & (y < height))[kept]])
-            x = width - 1 - (shown.x - left) if flip else shown.x - left
-            assert columns(found, width) == [each.tolist() for each in (shown.t_ns, x, shown.y - top, shown.p)]
+            inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+            shown = np.flatnonzero(inside & (whole.t_ns >= edges[0]) & (whole.t_ns < edges[-1]))
+            x = width - 1 - x if flip else x
+            assert columns(found, width) == [each[shown].tolist() for each in (whole.t_ns, x, y, whole.p)]
             every, most = data.draw(st.integers(1, 7)), data.draw(st.integers(1, 60))
             assert np.array_equal(file.times_of_every(every, most), whole.t_ns[::every][:most])
             assert file.head.events == len(whole)
@@ -123,7 +125,7 @@ def test_more_events_than_a_sample_may_take_are_refused_before_they_are_read(
     monkeypatch.setattr(event_file, "MOST_SAMPLE_EVENTS", 4999)
     words = "a sample takes 5,000 events; at most 4,999: give closer marks"
     with EventFile(written(tmp_path / "a.v2ve", SOME)) as events, pytest.raises(VideoError, match=words):
-        events.between(0, 5000, WHOLE)
+        events.between(np.array([0, 5000]), WHOLE)
 
 
 SOME = events_of(np.arange(5000), np.arange(5000) % 50, np.arange(5000) % 40, np.arange(5000) % 3 == 0)
@@ -138,7 +140,7 @@ def test_a_changed_bit_is_an_error(place: float, bit: int, tmp_path_factory: pyt
     data[at] ^= 1 << bit
     (folder / "a.v2ve").write_bytes(data)
     with pytest.raises(VideoError, match="prepare the recording again"), EventFile(folder / "a.v2ve") as events:
-        events.between(0, 5000, WHOLE)
+        events.between(np.array([0, 5000]), WHOLE)
 
 
 @pytest.mark.parametrize("kept", [0, 5, 31, 100, -1])
@@ -198,7 +200,7 @@ def test_a_forged_file_is_refused_without_the_memory_it_claims(
     tracemalloc.start()
     try:
         with pytest.raises(VideoError, match=words), EventFile(path) as events:
-            events.between(0, 5000, WHOLE)
+            events.between(np.array([0, 5000]), WHOLE)
         assert tracemalloc.get_traced_memory()[1] < 8 << 20
     finally:
         tracemalloc.stop()
