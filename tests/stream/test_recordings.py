@@ -66,6 +66,12 @@ def test_a_stream_resumes_after_each_batch_with_equal_bytes(server: LocalServer)
         assert bytes_of(first) == whole[number + 1]
 
 
+def test_two_equal_consumers_get_the_same_samples_at_once(server: LocalServer) -> None:
+    pairs = list(zip(stream(server, seed=9), stream(server, seed=9), strict=True))
+    assert len(pairs) == 10
+    assert [bytes_of(one) for one, _ in pairs] == [bytes_of(other) for _, other in pairs]
+
+
 @pytest.mark.parametrize(
     ("field", "value", "words"),
     [
