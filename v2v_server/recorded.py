@@ -25,6 +25,8 @@ from v2v_server.simulation.pixel import hot_pixels, words
 
 NOISE_RADIUS, NOISE_ANGLE = 1020, 1021
 """Purposes of the words of added noise (``noise.py``)."""
+_AT_ONCE = 1 << 13
+"""Pairs of normals that are made at once, within the processor's cache."""
 
 
 def fill_arrays(
@@ -129,11 +131,14 @@ def _store(values: npt.NDArray[Any], target: npt.NDArray[Any]) -> int:
 
 def _add_noise(params: SampleParams, flat: npt.NDArray[Any]) -> None:
     """Add the drawn noise to every bin, [grids x bins, pixels] float, and to hot pixels the same in all."""
-    added, size = params.added, flat.size
-    if sigma := added["added_sigma"]:
-        half = np.arange(-(-size // 2))
-        pairs = noise.box_muller(*(words(params.noise_key, purpose, half) for purpose in (NOISE_RADIUS, NOISE_ANGLE)))
-        flat += (np.float32(sigma) * np.concatenate(pairs)[:size]).reshape(flat.shape)
+    added, values = params.added, flat.reshape(-1)
+    half = -(-len(values) // 2)
+    for first in range(0, half if added["added_sigma"] else 0, _AT_ONCE):
+        at = np.arange(first, min(first + _AT_ONCE, half))
+        pairs = noise.box_muller(*(words(params.noise_key, purpose, at) for purpose in (NOISE_RADIUS, NOISE_ANGLE)))
+        for start, normals in zip((first, half + first), pairs, strict=True):
+            part = values[start : start + len(at)]
+            part += np.float32(added["added_sigma"]) * normals[: len(part)]
     count = int(added["added_hot_share"] * flat.shape[1] + 0.5)
     position, normals = hot_pixels(params.noise_key, count, flat.shape[1])
     flat[:, position] += np.float32(added["added_hot_sigma"]) * normals

@@ -110,12 +110,12 @@ class EventFile(AbstractContextManager["EventFile"]):
         wanted = np.arange(0, min(self.head.events, events * most), events)
         numbers, at = np.unique(np.searchsorted(self._firsts, wanted, "right") - 1, return_index=True)
         times = [
-            self._times(number)[part - self._firsts[number]]
+            self._times_of_block(number)[part - self._firsts[number]]
             for number, part in zip(numbers.tolist(), np.split(wanted, at[1:]), strict=False)
         ]
         return np.concatenate([np.empty(0, np.int64), *times])
 
-    def _times(self, number: int) -> npt.NDArray[np.int64]:
+    def _times_of_block(self, number: int) -> npt.NDArray[np.int64]:
         rows, record = self._rows(number)[:4].astype(np.int64), self.blocks[number]
         steps = rows[0] + (rows[1] << 8) + (rows[2] << 16) + (rows[3] << 24)
         times: npt.NDArray[np.int64] = record["t_ns"] + record["unit_ns"] * np.cumsum(steps)
