@@ -96,9 +96,9 @@ class EventFileWriter(ItemWriter):
 
     def _write_events(self, events: EventChunk) -> None:
         joined = EventChunk.join((self._waiting, events))
-        gaps = np.flatnonzero(np.diff(joined.t_ns) > _LONGEST_STEP_NS) + 1
+        gaps: list[int] = (np.flatnonzero(np.diff(joined.t_ns) > _LONGEST_STEP_NS) + 1).tolist()
         first = 0
-        for end in [*gaps.tolist(), len(joined) - (len(joined) - max(gaps, default=0)) % MOST_BLOCK_EVENTS]:
+        for end in [*gaps, len(joined) - (len(joined) - max(gaps, default=0)) % MOST_BLOCK_EVENTS]:
             for start in range(first, end, MOST_BLOCK_EVENTS):
                 self._write_block(joined.part(start, min(start + MOST_BLOCK_EVENTS, end)))
             first = end

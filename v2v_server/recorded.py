@@ -48,8 +48,10 @@ def fill_arrays(
         part = slice(parts[grid], parts[grid + 1])
         spans_events = recipe.bin_span == "events" and span_ns[0] != NEVER
         begin_ns, end_ns = span_ns if spans_events else times_ns
-        columns = (column[part] for column in (events.t_ns, events.pixel, events.brighter))
-        seen = _Seen(*columns, begin_ns, end_ns, spans_events, recipe.bins, latest)
+        seen = _Seen(
+            events.t_ns[part], events.pixel[part], events.brighter[part], begin_ns, end_ns, spans_events, recipe.bins,
+            latest,
+        )  # fmt: skip
         for name, target in out.items():
             clipped[name] += _store(_MAKERS[name](seen).reshape(target.shape[1:]), target[grid])
     if params.added:

@@ -17,8 +17,9 @@ from hypothesis import strategies as st
 from trainer.convert import cli
 from v2v_protocol.errors import UsageError
 from v2v_recordings import item_writer
+from v2v_recordings.item_writer import Written
 from v2v_recordings.items import EventChunk, Item, Picture, SensorSize
-from v2v_recordings.layout_writer import RecordingWriter, Written
+from v2v_recordings.layout_writer import RecordingWriter
 from v2v_recordings.reading import FORMS, RawForm
 
 

@@ -31,7 +31,7 @@ def unpack_block(rows, begin_ns, unit_ns, edges_ns, window, is_flipped, times, s
     top, left, height, width = window
     step_0, step_1, step_2, step_3, x_low, x_high, y_low, y_high = rows
     byte, two, three = np.uint32(8), np.uint32(16), np.uint32(24)
-    now, kept, count = np.int64(begin_ns), 0, rows.shape[1]
+    now, kept, count = np.int64(begin_ns), np.int64(0), rows.shape[1]
     for i in range(count):
         step = np.uint32(step_0[i]) | np.uint32(step_1[i]) << byte
         now += np.int64(step | np.uint32(step_2[i]) << two | np.uint32(step_3[i]) << three) * unit_ns
