@@ -114,6 +114,13 @@ def claimed(path: Path, dtype: str, count: int, chunk: int) -> None:
         file.create_dataset("events/ts", (count,), dtype, chunks=(chunk,), compression="gzip")
 
 
+def _large_chunk(path: Path) -> None:
+    """Let a file that is large enough for it have a chunk of 1 GiB, which is unpacked for each part that is read."""
+    claimed(path, "<f8", 1 << 27, 1 << 27)
+    with h5py.File(path, "a") as file:
+        file["padding"] = np.zeros(5_000_000, np.uint8)
+
+
 def _header_of_npy(path: Path) -> None:
     path.mkdir()
     for name in ("ts", "xy", "p"):
@@ -127,6 +134,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     "a.h5": (lambda path: claimed(path, "<f8", 10**12, 1 << 10), "is stated to be 8,000,000,000,000 bytes"),
     "b.h5": (lambda path: claimed(path, "<f8", 1 << 30, (1 << 27) + 1), "is stated to be"),
     "c": (_header_of_npy, "is stated to be"),
+    "g.h5": (_large_chunk, "a chunk is stated to be 1,073,741,824 bytes, and at most 536,870,912"),
     "d.aedat4": (lambda path: path.write_bytes(b"#!AER-DAT4" + bytes(1000)), "d.aedat4"),
     "e.txt": (lambda path: path.write_text("1e300 1 1 1\n2e300 1 1 1\n"), "out of range"),
     "f.txt": (
