@@ -23,7 +23,7 @@ from tests.clips import panned_luma, write_panned
 from tests.test_commands import MODULES, ROOT
 from v2v_recordings.items import EventChunk, Picture
 from v2v_recordings.layout_writer import RecordingWriter
-from v2v_server.recorded.convert import convert_recordings
+from v2v_server.prepare_recordings import convert_recordings
 
 VIDEOS = ("my.mp4", "VIDEO", "bigbuckbunny.mp4")
 FOLDERS = ("smaller", "DIR", "CLIPS", "CORPUS", "webvid10k", "my-videos", "clips")
