@@ -76,28 +76,31 @@ BEATEN, NEW = ("paper",), "davis346-measured"
 RECIPES = (*BEATEN, "noise-free", "clean", "davis346-running", NEW)
 MOST_LOST, MOST_TIMES = 0.03, 3.0
 """Bars: correlation that noise may cost, and factor between the rates of still pixels."""
-LAMPS_HZ, LEAST_STRENGTH = (100.0, 120.0), 0.4
+LAMPS_HZ, LEAST_STRENGTH = (100.0, 120.0), 0.8
 THRESHOLDS = np.array([0.1, 0.18, 0.3, 0.5, 0.85])
 NEAR_WHITE_PX, DARK = 17, 0.03
 CHOOSES = np.arange(SIDE**2) % SIDE % 2 == 0
 """Blocks of the sensor on which thresholds are chosen: its even stripes. The odd ones are reported."""
 
 
-def _columns(*keys: str) -> tuple[Column, ...]:
-    """Return columns: numbers with two decimals, but for those that count and that are texts."""
-    whole = ("recording", "light", "simulator", "at", "steps", "correlation_rank", "log_ratio_rank")
-    return tuple((key, key.replace("_", " "), "{}" if key in whole else "{:.2f}", 1) for key in keys)
+RANKED_BY = {"correlation": -1, "log_ratio": 1}
+"""What ranks simulators, and the sign that makes the best the smallest."""
+
+
+def _columns(texts: tuple[str, ...], numbers: tuple[str, ...]) -> tuple[Column, ...]:
+    forms = dict.fromkeys(texts, "{}") | dict.fromkeys(numbers, "{:.2f}")
+    return tuple((key, key.replace("_", " "), form, 1) for key, form in forms.items())
 
 
 _COLUMNS = _columns(
-    "recording", "light", "simulator", "at", "steps", "threshold", "correlation", "ceiling", "brighter", "darker",
-    "log_ratio", "ratio", "intervals", "missed", "invented", "mirrored", "still_hz", "sensor_still_hz",
+    ("recording", "light", "simulator", "at"),
+    ("threshold", "correlation", "ceiling", "log_ratio", "ratio", "intervals", "missed", "invented", "mirrored",
+     "still_hz", "sensor_still_hz"),
 )  # fmt: skip
 _RANKED = _columns(
-    "simulator", "at", "steps", "correlation", "correlation_low", "correlation_high", "correlation_rank", "log_ratio",
-    "log_ratio_low", "log_ratio_high", "log_ratio_rank", "ratio", "intervals", "missed", "invented", "still_hz",
-    "sensor_still_hz",
-)  # fmt: skip
+    ("simulator", "at", "correlation", "correlation_rank", "log_ratio", "log_ratio_rank"),
+    ("ratio", "intervals", "missed", "invented"),
+)
 
 
 def seen(path: Path) -> tuple[Recorded, str]:
@@ -258,8 +261,12 @@ def measure(asked: argparse.Namespace) -> Report:
     whole = list(over_all({key: found for key, found in parts.items() if key[0] not in failed}))
     if len(names) < 2:
         lines.append(f"The bar needs at least 2 recordings and was not judged: {', '.join(names) or 'none'} was read")
+    shown = [
+        row | {key: f"{row[key]:.2f} ({row[f'{key}_low']:.2f}-{row[f'{key}_high']:.2f})" for key in RANKED_BY}
+        for row in whole
+    ]
     return Report(
-        [*records, *whole], [(records, _COLUMNS), (whole, _RANKED)],
+        [*records, *whole], [(records, _COLUMNS), (shown, _RANKED)],
         [*lines, "The light of a recording cannot be told from these figures: it has to be known."],
         [*failed.values(), *(missed([*records, *whole]) if len(names) > 1 else [])],
     )  # fmt: skip
@@ -295,13 +302,17 @@ def over_all(parts: dict[tuple[str, str], list[Judged]]) -> Iterator[Record]:
     """Yield a row of each simulator and kind of threshold over all recordings, with its ranks and their intervals."""
     for at in dict.fromkeys(kind for _, kind in parts):
         found = {name: pooled(each) for (name, kind), each in parts.items() if kind == at}
+        found = dict(sorted(found.items(), key=lambda item: -item[1].value[FIGURES.index("correlation")]))
         ranks = dict[str, list[str]]()
-        for key, sign in (("correlation", -1), ("log_ratio", 1)):
+        for key, sign in RANKED_BY.items():
             place = FIGURES.index(key)
             values = np.array([[each.value[place], *each.drawn[:, place]] for each in found.values()])
             order = 1 + np.argsort(np.argsort(sign * values, axis=0, kind="stable"), axis=0)
             ends = np.quantile(order[:, 1:], [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=1, method="nearest").T
-            ranks[key] = [f"{own[0]} ({low}-{high})" for own, (low, high) in zip(order, ends, strict=True)]
+            ranks[key] = [
+                f"{own[0]} ({low}-{high})" if low < high else f"{own[0]}"
+                for own, (low, high) in zip(order, ends, strict=True)
+            ]
         for number, (name, each) in enumerate(found.items()):
             yield {
                 "recording": "all", "light": "stated", "stated": True, "simulator": name, "at": at,
@@ -312,11 +323,13 @@ def over_all(parts: dict[tuple[str, str], list[Judged]]) -> Iterator[Record]:
 def missed(records: list[Record]) -> list[str]:
     """Return the bars that the new preset misses, from the rows of recordings and those over all of them."""
     own = {(row["recording"], row["simulator"]): row for row in records if row["at"] == "own" and row["stated"]}
+    if not own:  # no recording states a light that was asked for
+        return []
     mine, quiet = (own["all", name] for name in (NEW, f"{NEW}, quiet"))
     found = [
         f"{key.replace('_', ' ')}: {NEW} {mine[key]:.3f}, {name} {own['all', name][key]:.3f}"
-        for name in BEATEN for key, sign in (("correlation", 1), ("log_ratio", -1))
-        if sign * mine[key] <= sign * own["all", name][key]
+        for name in BEATEN for key, sign in RANKED_BY.items()
+        if sign * mine[key] >= sign * own["all", name][key]
     ]  # fmt: skip
     if (lost := quiet["correlation"] - mine["correlation"]) > MOST_LOST:
         found.append(f"noise costs {lost:.3f} of the correlation; the bar is at {MOST_LOST:g}")

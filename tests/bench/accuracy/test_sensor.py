@@ -260,6 +260,7 @@ def test_each_bar_is_judged_by_its_own_figure(changed: dict[str, float], said: s
             del row["lamp"]
     assert "; ".join(sensor.missed(rows)).startswith(said)
     assert bool(sensor.missed(rows)) == bool(said)
+    assert sensor.missed([dict(row, stated=False) for row in rows]) == []
 
 
 def test_what_the_odd_stripes_show_chooses_nothing() -> None:
