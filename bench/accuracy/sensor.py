@@ -261,8 +261,8 @@ def measure(asked: argparse.Namespace) -> Report:
     whole = list(over_all({key: found for key, found in parts.items() if key[0] not in failed}))
     if len(names) < 2:
         lines.append(f"The bar needs at least 2 recordings and was not judged: {', '.join(names) or 'none'} was read")
-    shown = [
-        row | {key: f"{row[key]:.2f} ({row[f'{key}_low']:.2f}-{row[f'{key}_high']:.2f})" for key in RANKED_BY}
+    shown: list[Record] = [
+        {**row, **{key: f"{row[key]:.2f} ({row[f'{key}_low']:.2f}-{row[f'{key}_high']:.2f})" for key in RANKED_BY}}
         for row in whole
     ]
     return Report(
