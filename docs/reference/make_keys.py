@@ -8,7 +8,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from v2v_protocol.recipe import EFFECTS_SECTION, PRESET_FIELDS, STREAM_PRESETS, WORLDS_SECTION, Recipe
+from v2v_protocol.recipe import EFFECTS_SECTION, LISTED, PRESET_FIELDS, STREAM_PRESETS, WORLDS_SECTION, Recipe
 from v2v_protocol.settings import Setting, settings_of
 from v2v_protocol.spec import StreamSpec
 from v2v_server.config import ServeConfig
@@ -79,7 +79,7 @@ def page() -> str:
         *_section("Recipe", Recipe),
         *_sources(),
         "### Recipes by name\n",
-        *_presets(PRESET_FIELDS, "recipe"),
+        *_presets({name: PRESET_FIELDS[name] for name in LISTED}, "recipe"),
     ])  # fmt: skip
 
 
