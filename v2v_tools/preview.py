@@ -286,8 +286,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         "v2v-preview", "VIDEO|DIR [VIDEO ...] --out FILE [flags]",
         "Show the effect of a recipe on your videos: frames, events, flow, activity.",
         [
-            "v2v-preview clips/ --out sheet.png --recipe davis346",
-            "v2v-preview clip.mp4 --out compared.html --compare paper clean davis346",
+            "v2v-preview clips/ --out sheet.png --recipe davis346-measured",
+            "v2v-preview clip.mp4 --out compared.html --compare paper clean davis346-measured",
         ],
     )  # fmt: skip
     cameras = parser.group("Virtual cameras")

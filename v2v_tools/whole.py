@@ -80,7 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "Make the events of whole videos: full frame, whole length, one recording for each video.",
         [
             "v2v-simulate --whole clip.mp4 --out events/ --events h5",
-            "v2v-simulate --whole videos/ --out events/ --events raw --recipe davis346 --jobs 4",
+            "v2v-simulate --whole videos/ --out events/ --events raw --recipe davis346-measured --jobs 4",
         ],
     )  # fmt: skip
     which = add_corpus(parser, "Which videos", "a video, a folder of videos, or a list file")

@@ -10,6 +10,7 @@ from typing import Any
 
 from v2v_protocol.recipe import (
     EFFECTS_SECTION,
+    LISTED,
     PRESET_FIELDS,
     RECORDED_SECTION,
     STREAM_PRESETS,
@@ -87,7 +88,7 @@ def page() -> str:
         *_section("Recipe", Recipe),
         *_sources(),
         "### Recipes by name\n",
-        *_presets(PRESET_FIELDS, "recipe"),
+        *_presets({name: PRESET_FIELDS[name] for name in LISTED}, "recipe"),
     ])  # fmt: skip
 
 

@@ -85,6 +85,7 @@ PORTABLE: Mapping[str, Row] = {
     "sensor": Row("sensor"),
     "davis346": Row("davis346", (*_EVENTS, "frames")),
     "davis346-running": Row("davis346-running", (*_EVENTS, "frames")),
+    "davis346-measured": Row("davis346-measured", (*_EVENTS, "frames")),
     "natural-davis346": Row(spec={"preset": "natural-davis346"}, count=9),
     "balanced": Row(spec={"preset": "balanced", "sibling_spacing": 2}),
     "natural": Row(spec={"preset": "natural"}, count=9),
