@@ -50,6 +50,7 @@ BENCHES = {
     "learn": "accuracy.learn",
     "learn_flow": "accuracy.learn_flow",
     "recordings": "accuracy.recordings",
+    "tradeoff": "accuracy.tradeoff",
     "chaos": "chaos.chaos",
     "chaos_across": "chaos.across",
     "siege": "chaos.siege",
