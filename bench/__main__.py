@@ -40,6 +40,7 @@ BENCHES = {
     "substeps": "accuracy.substeps",
     "fit": "accuracy.fit",
     "sensor": "accuracy.sensor",
+    "noise": "accuracy.noise",
     "scene": "accuracy.scene",
     "defects": "accuracy.defects",
     "flow": "accuracy.flow",

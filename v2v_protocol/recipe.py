@@ -59,27 +59,29 @@ LARGEST_EVENTS = 2.0**49
 
 
 class Worst(NamedTuple):
-    """The most that an effect does to a pixel in a clip: ``worst(value, seconds)`` of its field.
+    """The most that an effect does to a pixel in a clip: ``worst(value, steps, seconds)`` of its field.
 
     Attributes:
         smallest, largest: limits of the pixel's thresholds, as multiples of the nominal ones.
         change: what is added to the changes of log intensity, summed over the clip, in thresholds of the pixel.
+        legs: parts of a step that are compared with the thresholds one after another.
     """
 
     smallest: float = 1.0
     largest: float = 1.0
     change: float = 0.0
+    legs: float = 1.0
 
 
-def worst_of(effects: Mapping[str, Collection[float]], seconds: float) -> Worst:
+def worst_of(effects: Mapping[str, Collection[float]], steps: int, seconds: float) -> Worst:
     """Return the most that effects do together.
 
     Args:
         effects: by field, the value of each, or the ends of its range.
-        seconds: duration of the clip.
+        steps, seconds: length of the clip.
     """
     cases = [
-        [setting.worst(value, seconds) for value in effects[name]]
+        [setting.worst(value, steps, seconds) for value in effects[name]]
         for name, setting in effect_settings().items()
         if setting.worst is not None and name in effects
     ]
@@ -87,6 +89,7 @@ def worst_of(effects: Mapping[str, Collection[float]], seconds: float) -> Worst:
         math.prod(min(case.smallest for case in each) for each in cases),
         math.prod(max(case.largest for case in each) for each in cases),
         sum(max(case.change for case in each) for each in cases),
+        max((case.legs for each in cases for case in each), default=1.0),
     )
 
 
@@ -106,9 +109,9 @@ def most_events(
         noise_sum: standard deviations of noise and of hot drift, summed over the steps, log units.
         worst: what the effects do, the values of a :class:`Worst`; without them, nothing.
     """
-    (low, high), (least, most, added) = log_ends, Worst(*worst)
+    (low, high), (least, most, added, legs) = log_ends, Worst(*worst)
     largest = max(thresholds) * most
-    change = (steps + 1) * (largest + (high - low)) + LARGEST_NORMAL * (noise_sum + added * largest)
+    change = (steps * legs + 1) * (largest + (high - low)) + LARGEST_NORMAL * (noise_sum + added * largest)
     return (change + max(abs(low), abs(high))) / (min(thresholds) * least)
 
 
@@ -370,7 +373,7 @@ class Recipe(Persisted):
         (0.0, 0.0), 0.0, 1.0, "standard deviation of each pixel's thresholds, as a share of the nominal ones",
         group=EFFECTS_SECTION,
         usual=(0.0, 0.3), mistake="Many pixels would fire far too easily. Divide percent by 100.",
-        worst=lambda sigma, _: Worst(
+        worst=lambda sigma, *_: Worst(
             max(1.0 - LARGEST_NORMAL * sigma, SMALLEST_THRESHOLD_SHARE), 1.0 + LARGEST_NORMAL * sigma
         ),
     )  # fmt: skip
@@ -388,7 +391,7 @@ class Recipe(Persisted):
         unit="Hz",
         usual=(0.0, 20.0),
         mistake="Every pixel would fire {0:g} events a second without a change. Divide millihertz by 1000.",
-        worst=lambda rate_hz, seconds: Worst(change=rate_hz * seconds),
+        worst=lambda rate_hz, _, seconds: Worst(change=rate_hz * seconds),
     )
     refractory_seconds: Range = span(
         (0.0, 0.0),
@@ -417,6 +420,16 @@ class Recipe(Persisted):
         usual=(0.0, 0.05),
         mistake="It is a share: divide percent by 100.",
     )
+
+    noise_band_share: Range = span(
+        (0.0, 0.0), 0.0, 10.0, "standard deviation of noise below noise_band_hz, as a share of the mean threshold",
+        is_later=True, usual=(0.0, 0.4), mistake="Still pixels would fire without a pause. Divide percent by 100.",
+        worst=lambda share, steps, _: Worst(change=8.0 * share * steps, legs=3.0 if share else 1.0),
+    )  # fmt: skip
+    noise_band_hz: Range = span(
+        (0.0, 0.0), 0.01, 1e4, "corner frequency of the noise of noise_band_share", unit="Hz", off=True, is_later=True,
+        usual=(1.0, 300.0), mistake="Noise of {0:g} Hz was not measured in a sensor.",
+    )  # fmt: skip
 
     world_speed_px: Range = span(
         (0.0, 0.0), 1e-3, 1e4,
@@ -465,6 +478,11 @@ class Recipe(Persisted):
                     f"recipe {name} = {getattr(self, name)}: the duration of a grid is that of voxel_seconds "
                     f"({format_value(self.voxel_seconds)}): set {name} to {alone}, or voxel_seconds to 0"
                 )
+        if any(self.noise_band_share) and not any(self.noise_band_hz):
+            raise RecipeError(
+                f"recipe noise_band_share = {format_value(self.noise_band_share)}: set noise_band_hz, the corner of "
+                "this noise, too"
+            )
         for name in self.log_drawn:
             low, high = getattr(self, name)
             if low <= 0.0 and low < high:
@@ -651,7 +669,7 @@ class Recipe(Persisted):
         unit = step_seconds if self.noise_unit == "second" else 1.0
         steps = self.spans * int(self.steps_at(self.frame_stride / step_seconds))
         segments = self.most_segments(steps) + steps * levels_per_step
-        worst = worst_of({name: getattr(self, name) for name in effect_settings()}, steps * step_seconds)
+        worst = worst_of({name: getattr(self, name) for name in effect_settings()}, segments, steps * step_seconds)
         return most_events(segments, ends, (low, high), steps * (sigma * math.sqrt(unit) + hot * unit), *worst)
 
     def warn(self, say: Callable[[str], object] = _LOG.warning) -> None:

@@ -102,7 +102,7 @@ class KernelInput:
     def worst(self) -> Worst:
         """The most that the effects do."""
         drawn = self.params.effects.items()
-        return worst_of({name: (value,) for name, value in drawn}, math.fsum(self.step_seconds))
+        return worst_of({name: (value,) for name, value in drawn}, self.segments, math.fsum(self.step_seconds))
 
     def timeline(self) -> Timeline:
         """Divide the clip into segments."""
@@ -299,6 +299,7 @@ class _General:
         self._tables = effects.prepare(
             params.effects, params.noise_key, given.intensity or Intensity(1.0, 1.0),
             given.step_seconds[part.step] * part.share, self._pixels, real,
+            (params.threshold_pos, params.threshold_neg),
         )  # fmt: skip
 
     def run(self, arrays: Mapping[str, npt.NDArray[Any]], listing: Doubles = _NO_LIST) -> dict[str, int]:

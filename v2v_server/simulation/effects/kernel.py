@@ -18,7 +18,7 @@ import numpy as np
 
 from v2v_server.simulation import noise
 from v2v_server.simulation.effects import EFFECTS
-from v2v_server.simulation.effects.state import At, Block, compiled, hook
+from v2v_server.simulation.effects.state import LEGS, At, Block, compiled, hook
 from v2v_server.simulation.pixel import (
     PITCH,
     PIXELS_A_BLOCK,
@@ -33,7 +33,7 @@ from v2v_server.simulation.pixel import (
 from v2v_server.simulation.representations import REPRESENTATIONS, Counts, Train
 from v2v_server.simulation.vectors import aligned_rows, use_widest_vectors
 
-_UNIT = np.float32(2.0**-24)
+_UNIT, _WHOLE = np.float32(2.0**-24), np.float32(1)
 _FIRST_ROW = (0, *accumulate(effect.ROWS for effect in EFFECTS))
 FIXED, UNIFORM, TRIANGULAR = range(3)
 """How residuals start."""
@@ -106,7 +106,7 @@ def _counted(number: int, function: Any, rest: Any) -> Any:
 
 
 _start, _see, _change, _after = (_linked(EFFECTS, name, _each) for name in ("start", "see", "change", "after"))
-_cross = _linked(EFFECTS, "cross", _until_true)
+_divide, _cross = (_linked(EFFECTS, name, _until_true) for name in ("divide", "cross"))
 _begin, _events, _end = (
     _linked(tuple(REPRESENTATIONS.values()), name, _counted) for name in ("begin", "events", "end")
 )
@@ -125,11 +125,12 @@ def _simulate(
     # One by one: rows that are unpacked from an array have unknown strides, and their loops are not vectorised.
     residual, change, signed, positive, negative, rises = state[0], state[1], state[2], state[3], state[4], state[5]
     falls, waited, blind, on, off, old = state[6], state[7], state[8], state[9], state[10], state[11]
-    levels, own = state[12:16], state[16:]
+    share, begun, legs, shares = state[16], state[17], state[18 : 18 + LEGS], state[18 + LEGS : 18 + 2 * LEGS]
+    levels, own = state[12:16], state[18 + 2 * LEGS :]
     radius_words, angle_words, normal = words[4], words[5], floats[4:]
     block = Block(
         residual, change, signed, rises, falls, waited, blind, timed, positive, negative, levels, words[:4],
-        floats[:4], tolerance, key,
+        floats[:4], tolerance, key, legs, shares, share, begun,
     )  # fmt: skip
     zero = tolerance - tolerance
     start_folds, time_folds = folds_of(key, noise.START), folds_of(key, noise.TIME)
@@ -148,7 +149,7 @@ def _simulate(
         look_up(table, shown, shown, levels[now])
         _begin(made, clipped, first)
         for i in range(PIXELS_A_BLOCK):
-            positive[i], negative[i] = threshold_pos, threshold_neg
+            positive[i], negative[i], share[i], begun[i] = threshold_pos, threshold_neg, _WHOLE, zero
         _start(tables, own, block, At(first, 0, False, now, now, shown))
         for i in range(PIXELS_A_BLOCK):
             uniform = np.float32(np.int32(word(start_folds, first + i) >> np.uint32(8))) * _UNIT
@@ -219,26 +220,31 @@ def _simulate(
                 drifting = residual if drifts_first else change
                 for spot in range(hot, next_hot):
                     drifting[hot_position[spot] - first] += hot_drift[spot] * segments.hot_scale[each]
-                if _cross(tables, own, block, at):
-                    for i in range(PIXELS_A_BLOCK):
-                        rises[i], falls[i] = max(signed[i], zero), max(zero - signed[i], zero)
-                else:
-                    for i in range(PIXELS_A_BLOCK):
-                        events, residual[i] = crossed(residual[i] + change[i], positive[i], negative[i], tolerance)
-                        signed[i], rises[i], falls[i] = events, max(events, zero), max(zero - events, zero)
-                _after(tables, own, block, at)
-                if is_first:
-                    for i in range(PIXELS_A_BLOCK):
-                        on[i], off[i] = rises[i], falls[i]
-                else:
-                    for i in range(PIXELS_A_BLOCK):
-                        on[i] += rises[i]
-                        off[i] += falls[i]
-                if timed:
-                    if drifts_first:
-                        for spot in range(hot, next_hot):
-                            change[hot_position[spot] - first] += hot_drift[spot] * segments.hot_scale[each]
-                    _time(each, block, old, first, last, time_folds, made, clipped)
+                parts = LEGS if _divide(tables, own, block, at) else 1
+                for leg in range(parts):
+                    at = At(first, each, moved, before, now, shown, leg, parts)
+                    if parts > 1:
+                        _take_leg(leg, block, old)
+                    if _cross(tables, own, block, at):
+                        for i in range(PIXELS_A_BLOCK):
+                            rises[i], falls[i] = max(signed[i], zero), max(zero - signed[i], zero)
+                    else:
+                        for i in range(PIXELS_A_BLOCK):
+                            events, residual[i] = crossed(residual[i] + change[i], positive[i], negative[i], tolerance)
+                            signed[i], rises[i], falls[i] = events, max(events, zero), max(zero - events, zero)
+                    _after(tables, own, block, at)
+                    if is_first and leg == 0:
+                        for i in range(PIXELS_A_BLOCK):
+                            on[i], off[i] = rises[i], falls[i]
+                    else:
+                        for i in range(PIXELS_A_BLOCK):
+                            on[i] += rises[i]
+                            off[i] += falls[i]
+                    if timed:
+                        if drifts_first:
+                            for spot in range(hot, next_hot):
+                                change[hot_position[spot] - first] += hot_drift[spot] * segments.hot_scale[each]
+                        _time(each, block, old, first, last, time_folds, made, clipped)
             if each == count - 1 or segments.bin[each + 1] != of_bin:
                 net = on if is_plain else signed
                 if not is_plain:
@@ -248,14 +254,36 @@ def _simulate(
 
 
 @compiled
+def _take_leg(leg, block, old):
+    """Make a leg the step, in loops of two rows, which the compiler vectorises."""
+    use_widest_vectors()  # type: ignore[call-arg]
+    change, share, begun, residual = block.change, block.share, block.begun, block.residual
+    for i in range(PIXELS_A_BLOCK):
+        change[i] = block.legs[leg, i]
+    if leg > 0:
+        for i in range(PIXELS_A_BLOCK):
+            begun[i] += share[i]
+    else:
+        for i in range(PIXELS_A_BLOCK):
+            begun[i] = block.tolerance - block.tolerance
+    for i in range(PIXELS_A_BLOCK):
+        share[i] = block.shares[leg, i]
+    if block.timed:
+        for i in range(PIXELS_A_BLOCK):
+            old[i] = residual[i]
+        for i in range(PIXELS_A_BLOCK):
+            block.waited[i] = block.blind[i] = block.tolerance - block.tolerance
+
+
+@compiled
 def _time(each, block, old, first, last, folds, made, clipped):
-    """Give every event of a segment its time, and pass it to the representations.
+    """Give every event of a segment, or of a leg of it, its time, and pass it to the representations.
 
     Crossings of one pixel come at equal distances. Events that no change of intensity caused (shot noise) come at
-    random times.
+    random times of the segment.
 
     Args:
-        old: [block] real, the residual at the start of the segment.
+        old: [block] real, the residual at its start.
         folds: of the noise's words for these times.
     """
     for i in range(last - first):
@@ -274,6 +302,7 @@ def _time(each, block, old, first, last, folds, made, clipped):
                 passed = min(max(block.waited[i] + (threshold - sign * np.float64(old[i])) / speed, 0.0), 1.0)
                 apart = min(apart, (1.0 - passed) / max(crossings - 1, 1))
             if crossings > 0:
+                passed, apart = block.begun[i] + block.share[i] * passed, block.share[i] * apart
                 _events(made, clipped, Train(first + i, i, each, is_rising, passed, apart, crossings))
             for k in range(crossings, events):
                 drawn = word((word(folds, first + i), np.uint32(each)), np.uint32(2 * k + is_rising))
@@ -307,7 +336,7 @@ def simulate_general(
         clipped: [representations] int64, to which the number of values that did not fit is added.
         tables: of all effects, ``effects.prepare``.
     """
-    state = aligned_rows(16 + _FIRST_ROW[-1], PITCH, table.dtype)
+    state = aligned_rows(18 + 2 * LEGS + _FIRST_ROW[-1], PITCH, table.dtype)
     words = aligned_rows(6, PITCH, np.uint32)
     floats = aligned_rows(6, PITCH, np.float32)
     _simulate(

@@ -104,8 +104,8 @@ def start(tables, own, block, at):
 
 @hook
 def after(tables, own, block, at):
-    """Add the events."""
-    if len(tables.shot) > 0:
+    """Add the events, once in a step."""
+    if len(tables.shot) > 0 and at.leg == at.legs - 1:
         of_step, drawn = tables.table_of_step[at.step], tables.drawn
         _draw(drawn, tables.of_steps[0, at.step], tables.of_steps[1, at.step])
         _fire(

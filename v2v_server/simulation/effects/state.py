@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numba
@@ -25,6 +26,10 @@ hook: Any = numba.njit(forceinline=True, **_OPTIONS)
 """The same for an effect's functions, which are inlined into the kernel."""
 
 
+LEGS = 3
+"""Parts of a step that an effect divides."""
+
+
 class Clip(NamedTuple):
     """Inputs of an effect's tables.
 
@@ -36,6 +41,8 @@ class Clip(NamedTuple):
         pixels: number of pixels of the picture.
         real: arithmetic of the pixels, float32 or float64.
         key: key of the sample's noise.
+        effects: the draw, by field; missing fields are off.
+        thresholds: nominal ones, positive and negative, log units.
     """
 
     light: npt.NDArray[np.float64]
@@ -45,6 +52,8 @@ class Clip(NamedTuple):
     pixels: int
     real: Real
     key: noise.NoiseKey
+    effects: Mapping[str, float]
+    thresholds: tuple[float, float]
 
 
 class Block(NamedTuple):
@@ -52,16 +61,19 @@ class Block(NamedTuple):
 
     Attributes:
         residual: remaining change since the last event, log units.
-        change: change that this step adds to the residual, log units.
-        signed: signed crossings of a threshold in this step.
-        rises, falls: positive and negative events of this step.
-        waited, blind: shares of the step in which the pixel is blind at its start and after each event.
+        change: change that this step adds to the residual, log units; of a divided step, that of the leg.
+        signed: signed crossings of a threshold in this step or leg.
+        rises, falls: its positive and negative events.
+        waited, blind: shares of it in which the pixel is blind at its start and after each event.
         timed: whether events need times, and so ``waited`` and ``blind``.
         positive, negative: the thresholds of each pixel, log units.
         levels: rows of log intensity, see :class:`At`.
         words: [4] uint32 rows, and ``floats``: [4] float32 rows, free for use within one call.
         tolerance: real, see ``voxel.py``.
         key: [4] uint32, the noise key.
+        legs, shares: [LEGS] rows for a step that is divided: the change of each leg, and its share of the time.
+        share, begun: share of the step's time that the leg takes, and that has passed before it; 1 and 0 for a step in
+            one piece.
     """
 
     residual: Any
@@ -79,6 +91,10 @@ class Block(NamedTuple):
     floats: Any
     tolerance: Any
     key: Any
+    legs: Any
+    shares: Any
+    share: Any
+    begun: Any
 
 
 class At(NamedTuple):
@@ -91,6 +107,7 @@ class At(NamedTuple):
         before, now: rows of ``Block.levels``: log intensity before and after the step.
         shown: [width] uint8 or uint16, grey levels of the frame at or after its end; narrower than the block at the
             end of the picture.
+        leg: number of the leg; ``legs``: how many the step has, LEGS or 1.
     """
 
     first: Any
@@ -99,3 +116,5 @@ class At(NamedTuple):
     before: Any
     now: Any
     shown: Any
+    leg: Any = 0
+    legs: Any = 1
