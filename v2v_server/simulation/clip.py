@@ -347,11 +347,11 @@ def _grey(frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 def _most_events(given: KernelInput, log_ends: tuple[float, float]) -> float:
     params = given.params
-    thresholds = params.threshold_pos, params.threshold_neg
     hot_sigma = params.hot_pixel_sigma if params.hot_pixel_count else 0.0
     noise_total = noise_sum(params.noise_sigma, hot_sigma, given.noise_durations)
-    events = most_events(given.segments, log_ends, thresholds, noise_total, *given.worst)
-    return events * (EFFECTS_MARGIN if params.effects else 1.0)
+    return (EFFECTS_MARGIN if params.effects else 1.0) * most_events(
+        given.segments, log_ends, (params.threshold_pos, params.threshold_neg), noise_total, *given.worst
+    )
 
 
 def _log_ends(intensity: Intensity) -> tuple[float, float]:
