@@ -68,7 +68,7 @@ def test_arrays_count_the_events_of_the_list() -> None:
 
 
 def test_noise_without_a_corner_is_refused() -> None:
-    with pytest.raises(UsageError, match="noise_band_share = 0.3: set noise_band_hz"):
+    with pytest.raises(UsageError, match=r"noise_band_share = 0\.3: set noise_band_hz"):
         simulate(STILL, **NOISE | {"noise_band_hz": 0.0}, frames_per_second=30.0)
     with pytest.raises(RecipeError, match="set noise_band_hz"):
         Recipe(noise_band_share=(0.1, 0.2))
