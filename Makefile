@@ -6,22 +6,26 @@ READY := $(VENV)/.ready
 OLD_NUMPY := .venv-old-numpy
 DOCS := .venv-docs
 PICTURE := .venv-picture
+RELEASE := .venv-release
 VIDEO ?= $(PICTURE)/clip.mp4
 CLIPS := .demo/videos
+# The address of the clone's origin, for links in the site and in a package's metadata.
+REPOSITORY = $(shell git config remote.origin.url | sed -e 's|^git@\([^:]*\):|https://\1/|' -e 's|//[^/@]*@|//|' -e 's|\.git$$||' | grep ^https)
 
 # Hundreds of test processes start; without stored bytecode each compiles every module that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help picture demo test test-slow test-old-numpy check docs format clean
+.PHONY: help picture demo test test-slow test-old-numpy check docs release format clean
 
 help:
 	@echo "make picture         the first picture, of a clip or of VIDEO=my.mp4, and how long it took: out/preview.png"
 	@echo "make demo            reconstruct a clip, stream real ones through a server, train on them; leaves out/*.png"
-	@echo "make test            the fast tests (four minutes on two cores, the first time)"
+	@echo "make test            the fast tests (twelve minutes on two cores)"
 	@echo "make test-slow       the tests that take longer"
-	@echo "make test-old-numpy  the table of digests under an older numpy"
+	@echo "make test-old-numpy  the table of digests under an older numpy, and OpenCV without contrib"
 	@echo "make check           formatting, lint, types; the snippets and command lines of the pages"
 	@echo "make docs            the documentation as a site, in out/site"
+	@echo "make release         wheel, source distribution, list of components and hashes, in out/release"
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -69,6 +73,8 @@ $(OLD_NUMPY)/.ready: pyproject.toml constraints.txt
 	grep -v -i -E '^(numpy|scipy|scikit-image|matplotlib|contourpy|torch)==' constraints.txt > $(OLD_NUMPY)/constraints.txt
 	$(OLD_NUMPY)/bin/python -m pip install --quiet --constraint $(OLD_NUMPY)/constraints.txt 'numpy==2.0.*' \
 		--editable '.[server]' pytest pytest-timeout hypothesis
+	$(OLD_NUMPY)/bin/python -m pip uninstall --quiet --yes opencv-contrib-python-headless
+	$(OLD_NUMPY)/bin/python -m pip install --quiet --no-deps $$(sed -n 's/^opencv-contrib-python/opencv-python/p' constraints.txt)
 	touch $@
 
 test-old-numpy: $(OLD_NUMPY)/.ready
@@ -88,12 +94,20 @@ $(DOCS)/.ready: pyproject.toml constraints.txt
 
 # The pages' own tools, apart: they need no package of ours, and ours need none of them.
 docs: $(DOCS)/.ready
-	REPOSITORY_URL=$$(git config remote.origin.url | sed -e 's|^git@\([^:]*\):|https://\1/|' -e 's|//[^/@]*@|//|' -e 's|\.git$$||' | grep ^https) \
-		NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict
+	REPOSITORY_URL=$(REPOSITORY) NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --strict
+
+$(RELEASE)/.ready: constraints.txt
+	$(PYTHON) -m venv $(RELEASE)
+	$(RELEASE)/bin/python -m pip install --quiet 'build>=1.2' 'cyclonedx-bom>=7' 'twine>=6.1'
+	touch $@
+
+# All of a release but the upload: out/release, from the commit, built twice with equal bytes.
+release: $(RELEASE)/.ready
+	REPOSITORY_URL=$(REPOSITORY) $(RELEASE)/bin/python deploy/release.py
 
 format: $(READY)
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
 clean:
-	rm -rf $(VENV) $(OLD_NUMPY) $(DOCS) $(PICTURE) .demo out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(OLD_NUMPY) $(DOCS) $(PICTURE) $(RELEASE) .demo out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,11 +1,11 @@
 #!/bin/bash
-# Train FireNet and E2VID on one GPU, resume once, score both, and leave the figures as JSON in a folder.
+# Time one training step by precision, memory format and launch, train FireNet and E2VID with the fastest settings, resume
+# once, score both, and leave the figures as JSON in a folder: all that a first run on one GPU has to tell.
 #
 #     bash examples/gpu_first.sh
 #     PYTHON=python3 WHEELS=wheels OUT=results bash examples/gpu_first.sh        # without a network
 #
-# With 16 cores it should end within 10 minutes: each network trains for two minutes, and the rest
-# takes about five. Longer trainings need a longer call: SECONDS_EACH=240 takes four minutes more. A stage that fails does
+# With 16 cores it should end within 10 minutes: each network trains for two minutes, and the rest takes about six. Longer trainings need a longer call: SECONDS_EACH=240 takes four minutes more. A stage that fails does
 # not stop the next ones, and summary.json is written again after each stage. In it, of each training:
 #
 #   batches_per_second    without the first reading, while libraries choose kernels and the CUDA graph is recorded
@@ -14,6 +14,9 @@
 #   gpu_busy_share        share of the time in which the GPU computed, as nvidia-smi says; in the rest it waited
 #   gpu_peak_memory_mib   memory of the GPU in use, other programs' included
 #   held_out_losses       of samples that are not trained on, each 500 steps and at the end
+#
+# and of each network, as "step", the settings that it trained with and their seconds a step on resident data; all rows of
+# `python -m bench step` are in NAME_step.json.
 #
 # What can be set; paths are relative to the checkout:
 #
@@ -28,7 +31,10 @@
 #   RECORDINGS    folder of recordings to score on (default: those of `python -m bench recordings`)
 #   WEIGHTS       folder of the weight files that docs/training.md names (default weights). A loss whose files are not
 #                 there is left out: without any, both networks train with L1 alone.
-#   DEVICE        cuda (default) or cpu; on cuda, with bfloat16 and CUDA graphs
+#   DEVICE        cuda (default) or cpu
+#   LAUNCHES      how steps are launched where they are timed (default eager,graph; on cpu eager). eager,compile,graph
+#                 also tries compiled ones, which takes minutes more.
+#   STEPS_TIMED   timed steps of each row (default 5)
 #   WORKERS       workers of the server (default: all cores but two)
 #   BATCH, GRIDS, CROP    batch: clips, voxel grids of each, side in px (default 12, 40, 128, as in the paper)
 #   FRAMES, SIDE, FEED_SECONDS    frames of a clip made here, side of the recordings made here in px, seconds of the load
@@ -39,7 +45,7 @@ cd "$(dirname "$0")/.." || exit 2
 OUT=${OUT:-out/gpu_first} WHEELS=${WHEELS:-} WEIGHTS=${WEIGHTS:-weights}
 VIDEOS=${VIDEOS:-} RECORDINGS=${RECORDINGS:-} DEVICE=${DEVICE:-cuda}
 SECONDS_EACH=${SECONDS_EACH:-120} STEPS_EACH=${STEPS_EACH:-0} FEED_SECONDS=${FEED_SECONDS:-15}
-BATCH=${BATCH:-12} GRIDS=${GRIDS:-40} CROP=${CROP:-128} FRAMES=${FRAMES:-450} SIDE=${SIDE:-64}
+STEPS_TIMED=${STEPS_TIMED:-5} BATCH=${BATCH:-12} GRIDS=${GRIDS:-40} CROP=${CROP:-128} FRAMES=${FRAMES:-450} SIDE=${SIDE:-64}
 cores=$(nproc)
 WORKERS=${WORKERS:-$((cores > 3 ? cores - 2 : 1))}
 if [ -z "${PYTHON:-}" ]; then
@@ -126,6 +132,8 @@ if before and after:
         "loss_after": after["loss_first"],
     }
 scores = {name: read(f"{name}_scores.json") for name in ("firenet", "e2vid")}
+steps = {name: [row for row in read(f"{name}_step.json") or [] if "seconds" in row] for name in scores}
+summary["step"] = {name: rows and min(rows, key=lambda row: row["seconds"]) for name, rows in steps.items()}
 summary["scores"] = {name: each and [row for row in each if row["sequence"] is None] for name, each in scores.items()}
 (out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
 PYTHON
@@ -157,7 +165,7 @@ import sys
 
 import torch
 
-import bench.accuracy.recordings, bench.corpus, trainer.evaluation.cli, trainer.train, v2v_client.loadtest, v2v_server.serve
+import bench.accuracy.recordings, bench.corpus, bench.speed.step, trainer.evaluation.cli, trainer.train, v2v_client.loadtest, v2v_server.serve
 
 facts = {"device": "cpu", "cores": len(os.sched_getaffinity(0)), "python": platform.python_version()}
 facts |= {"torch": torch.__version__, "cuda": torch.version.cuda}
@@ -219,16 +227,40 @@ train() {
         --set "stream.recipe.voxels_per_clip=$GRIDS" --set "stream.recipe.crop_height_px=$CROP" \
         --set "stream.recipe.crop_width_px=$CROP" --set "compute.device=$DEVICE" --set run.epochs=1000000 \
         --set run.log_every=10 --set run.preview_every=0 --set "run.seconds=$seconds" --set "run.steps=$steps" \
-        "${compute[@]}" "${settings[@]}" "$@" || status=$?
+        "${loader[@]}" "$@" "${settings[@]}" || status=$?
     kill "$watcher" 2>/dev/null
     wait "$watcher" 2>/dev/null
     cp "$WORK/runs/$name/metrics.jsonl" "$OUT/$name.jsonl" || status=1
     return "$status"
 }
 
+# Time one step of a network in each way: its name, its configuration and more flags.
+time_step() {
+    local name=$1 configuration=$2
+    shift 2
+    bench step "$configuration" --device "$DEVICE" --batch "$BATCH" --grids "$GRIDS" --crop "$CROP" \
+        --launches "$LAUNCHES" --steps "$STEPS_TIMED" --json "$OUT/${name}_step.json" "${settings[@]}" "$@"
+}
+
+# Print the settings of a network's fastest step, one a line; nothing if none was timed.
+fastest() {
+    "$PYTHON" - "$OUT/$1_step.json" <<'PYTHON'
+import json
+import sys
+from pathlib import Path
+
+file = Path(sys.argv[1])
+rows = [row for row in json.loads(file.read_text()) if "seconds" in row] if file.exists() else []
+print(*min(rows, key=lambda row: row["seconds"])["settings"].split() if rows else [], sep="\n")
+PYTHON
+}
+
+# Status 1 of v2v-eval: some recordings, which it names, have no pictures to score by. Those that have are scored.
 score() {
+    local status=0
     v2v eval --weights "$WORK/runs/$2/last.pt" --data "$RECORDINGS" --device "$DEVICE" --json "$OUT/$1_scores.json" \
-        "${lpips[@]}"
+        "${lpips[@]}" || status=$?
+    [ "$status" = 1 ] && [ -s "$OUT/$1_scores.json" ] || return "$status"
 }
 
 status=0
@@ -244,10 +276,9 @@ if [ "$status" != 0 ]; then
 fi
 echo "install 0 $SECONDS" >"$WORK/stages"
 
-compute=()
-if [ "$DEVICE" = cuda ]; then
-    compute=(--set compute.precision=bfloat16 --set compute.cuda_graph=true --set stream.loader_workers=1)
-fi
+LAUNCHES=${LAUNCHES:-$([ "$DEVICE" = cuda ] && echo eager,graph || echo eager)}
+loader=()
+[ "$DEVICE" != cuda ] || loader=(--set stream.loader_workers=1)
 settings=()
 for setting in ${SETTINGS:-}; do settings+=(--set "$setting"); done
 
@@ -255,16 +286,25 @@ for setting in ${SETTINGS:-}; do settings+=(--set "$setting"); done
 firenet=(--set loss.lpips_weight=0) e2vid=(--set loss.lpips_weight=0) lpips=()
 backbone=$WEIGHTS/squeezenet1_1-b8a52dc0.pth heads=$WEIGHTS/lpips-v0.1-squeeze.pth
 if [ -f "$backbone" ] && [ -f "$heads" ]; then
-    firenet=(--set "loss.lpips_backbone=$backbone" --set "loss.lpips_heads=$heads")
+    firenet=(--set loss.lpips_weight=1 --set "loss.lpips_backbone=$backbone" --set "loss.lpips_heads=$heads")
     lpips=(--lpips squeeze "$backbone" "$heads")
 fi
 firenet+=(--set stream.videos_kind=videos --set stream.recipe.preset=paper) # the configuration is for photographs
 backbone=$WEIGHTS/vgg16-397923af.pth heads=$WEIGHTS/lpips-v0.1-vgg.pth
 if [ -f "$backbone" ] && [ -f "$heads" ]; then
-    e2vid=(--set "loss.lpips_backbone=$backbone" --set "loss.lpips_heads=$heads")
+    e2vid=(--set loss.lpips_weight=1 --set "loss.lpips_backbone=$backbone" --set "loss.lpips_heads=$heads")
 fi
 raft=$WEIGHTS/raft_small_C_T_V2-01064c6d.pth
-if [ -f "$raft" ]; then e2vid+=(--set "loss.raft_weights=$raft"); else e2vid+=(--set loss.temporal_weight=0); fi
+if [ -f "$raft" ]; then
+    e2vid+=(--set loss.temporal_weight=1 --set "loss.raft_weights=$raft")
+else
+    e2vid+=(--set loss.temporal_weight=0)
+fi
+
+stage step_firenet time_step firenet firenet-cpu "${firenet[@]}"
+stage step_e2vid time_step e2vid e2vid "${e2vid[@]}"
+for setting in $(fastest firenet); do firenet+=(--set "$setting"); done
+for setting in $(fastest e2vid); do e2vid+=(--set "$setting"); done
 
 stage prepare prepare || exit 1
 VIDEOS=${VIDEOS:-$WORK/videos} RECORDINGS=${RECORDINGS:-$WORK/recordings}

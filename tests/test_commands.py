@@ -8,6 +8,8 @@ import re
 import shlex
 import sys
 import tomllib
+from collections.abc import Sequence
+from contextlib import suppress
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -15,6 +17,8 @@ from pathlib import Path
 import pytest
 
 from bench.__main__ import BENCHES, parser_for
+from v2v_protocol.command import Parser
+from v2v_protocol.errors import UsageError
 
 ROOT = Path(__file__).parents[1]
 MODULES = {
@@ -40,11 +44,18 @@ _LAUNCHED = {
     "examples/overfit.py": "examples.overfit",
     "examples/detect.py": "examples.detect",
     "examples/render_sprites.py": "examples.render_sprites",
-    "examples.firenet_data": "examples.firenet_data",
     "examples.ray_train": "examples.ray_train",
     "trainer.run.export": "trainer.run.export",
+    "tests.tools.trace": "tests.tools.trace",
 }
 """What `python` and `torchrun` start beside benches."""
+_MODES = {
+    ("v2v-train", "export"): "trainer.run.export",
+    ("v2v-train", "data"): "trainer.run.data",
+    ("v2v-simulate", "--whole"): "v2v_tools.whole",
+    ("v2v-simulate", "--count"): "v2v_tools.sample_set",
+}
+"""Modules with the parser of a program that has other flags beside this word."""
 _STANDS_FOR_ANY = {"train.py": "the reader's own script"}
 PAGES = sorted(
     page
@@ -57,7 +68,7 @@ PAGES = sorted(
 )
 """Decisions and notes are of their day, and stay as they were."""
 _LINE = re.compile(r"\b(v2v[- ][a-z]+)((?: [^\n`|;&#)]*)?)")
-_FLAG = re.compile(r"(?<=\s)(--[a-z][a-z-]*)")
+_WORD = re.compile(r"(?<=\s)(--[a-z][a-z-]*|export|data(?= firenet))")
 
 
 class _Caught(Exception):
@@ -83,16 +94,21 @@ def parser_of(module: str) -> argparse.ArgumentParser:
     return found[0]
 
 
-def flags_of(program: str) -> frozenset[str]:
-    """Return all flags that the program's own parser knows."""
-    return frozenset(parser_of(MODULES[program])._option_string_actions)
+def module_of(program: str, words: Sequence[str] = ()) -> str:
+    """Return the module whose parser reads these words."""
+    return next((_MODES[program, word] for word in words if (program, word) in _MODES), MODULES[program])
+
+
+def flags_of(program: str, words: Sequence[str] = ()) -> frozenset[str]:
+    """Return all flags that the program knows beside these words."""
+    return frozenset(parser_of(module_of(program, words))._option_string_actions)
 
 
 def command_lines(text: str) -> list[tuple[str, list[str]]]:
-    """Yield (program, its flags) for each command line in a text. A backslash at the end continues a line."""
+    """Yield (program, its words) for each command line in a text. A backslash at the end continues a line."""
     joined = re.sub(r"\\\n\s*#?\s*", " ", text)
     return [
-        (program, _FLAG.findall(rest))
+        (program, _WORD.findall(rest))
         for said, rest in _LINE.findall(joined)
         if (program := said.replace(" ", "-")) in MODULES
     ]
@@ -112,10 +128,10 @@ def test_every_program_is_checked() -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_shown_flags_exist(page: Path) -> None:
     wrong = [
-        f"{program} {flag}"
-        for program, flags in command_lines(page.read_text(encoding="utf-8"))
-        for flag in flags
-        if flag not in flags_of(program)
+        f"{program} {word}"
+        for program, words in command_lines(page.read_text(encoding="utf-8"))
+        for word in words
+        if word[0] == "-" and word not in flags_of(program, words)
     ]
     assert wrong == []
 
@@ -126,9 +142,9 @@ def test_images_start_programs_with_valid_flags() -> None:
         *re.findall(r"command: (\[\"--.*\])$", (ROOT / "deploy" / "compose.yaml").read_text(), re.M),
     ]
     assert len(lists) == 3
-    assert set(_FLAG.findall(" ".join(lists).replace('"', " "))) <= flags_of("v2v-serve")
+    assert set(_WORD.findall(" ".join(lists).replace('"', " "))) <= flags_of("v2v-serve")
     (train,) = re.findall(r"command: (\[\"\$.*\])$", (ROOT / "deploy" / "compose.yaml").read_text(), re.M)
-    assert set(_FLAG.findall(train.replace('"', " "))) <= flags_of("v2v-train")
+    assert set(_WORD.findall(train.replace('"', " "))) <= flags_of("v2v-train")
 
 
 def block_lines(text: str) -> list[list[str]]:
@@ -160,7 +176,10 @@ def wrong_with(words: list[str]) -> str:
         return f"there is no {missing}" if missing else ""
     if program in ("python", "torchrun"):
         return _wrong_with_launched(rest)
-    return _refused(parser_of(MODULES[program]), rest) if program in MODULES else "no program"
+    if program not in MODULES:
+        return "no program"
+    mode = rest[:1] in (["export"], ["data"])
+    return _refused(parser_of(module_of(program, rest)), rest[mode:])
 
 
 def _wrong_with_launched(words: list[str]) -> str:
@@ -183,9 +202,12 @@ def _wrong_with_launched(words: list[str]) -> str:
 
 def _refused(parser: argparse.ArgumentParser, given: list[str]) -> str:
     try:
-        parser.parse_args(given)
+        arguments = parser.parse_args(given)
     except SystemExit as ended:
         return "" if not ended.code else f"its own parser refuses {given}"
+    with suppress(UsageError):  # a page's folders are not here
+        if isinstance(parser, Parser):
+            parser.check_outputs(arguments)
     return ""
 
 
@@ -213,7 +235,7 @@ def test_faulty_command_lines_are_detected() -> None:
         assert wrong_with(shlex.split(line)), line
 
 
-BARE = re.compile(r"`(--[a-z][a-z-]*)[^`]*`")
+BARE = re.compile(r"`(--[a-z][a-z-]*)(?![a-z_-])[^`]*`")
 PROGRAM = re.compile(r"`(v2v-[a-z]+)[ `]")
 
 OF_OTHERS = {"--constraint": "pip", "--profile": "docker compose", "--standalone": "torchrun", "--shm-size": "docker"}
@@ -224,5 +246,5 @@ def test_programs_and_flags_named_in_prose_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     assert set(PROGRAM.findall(text)) <= {*MODULES, "v2v-stream", "v2v-workers"}
     named = set(BARE.findall(text)) - set(OF_OTHERS)
-    parsers = [*map(parser_of, MODULES.values()), *map(parser_for, BENCHES)]
+    parsers = [*map(parser_of, (*MODULES.values(), *_MODES.values())), *map(parser_for, BENCHES)]
     assert named <= {flag for parser in parsers for flag in parser._option_string_actions}

@@ -20,7 +20,7 @@ from v2v_server.commands.quarantine import main as quarantine
 from v2v_server.commands.serve import main as serve
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.videos import VideoEntry
-from v2v_server.schedule import LARGEST_MEMORY_BYTES, WORKER_BYTES, lease_bytes
+from v2v_server.lease_memory import LARGEST_MEMORY_BYTES, WORKER_BYTES, lease_bytes
 from v2v_server.video.rows import Rows
 
 DEPLOY = Path(__file__).parents[1] / "deploy"
@@ -59,9 +59,9 @@ def test_workers_are_given_the_memory_that_the_largest_usual_clip_needs() -> Non
     arrays = layout_bytes(array_layout(spec.recipe, spec.voxel_dtype, DEFAULT_ARRAYS))
     needed = lease_bytes(VideoEntry("v.mp4", "f", 999, 3840, 2160, 30.0, "hevc"), Rows(), spec, arrays)
     assert needed <= WORKER_BYTES < 1.1 * needed
-    worker = yaml.safe_load((DEPLOY / "kubernetes" / "workers.yaml").read_text())
-    (container,) = worker["spec"]["template"]["spec"]["containers"]
-    given = [container["resources"][kind]["memory"] for kind in ("requests", "limits")]
+    (patch,) = yaml.safe_load((DEPLOY / "kubernetes" / "kustomization.yaml").read_text())["patches"]
+    (resources,) = [each["value"] for each in yaml.safe_load(patch["patch"])]
+    given = [resources[kind]["memory"] for kind in ("requests", "limits")]
     given += re.findall(r"--mem-per-cpu=(\S+)", (DEPLOY / "slurm" / "train.sbatch").read_text())
     assert [_bytes(text) for text in given] == 3 * [WORKER_BYTES]
     unit = (DEPLOY / "systemd" / "v2v-worker@.service").read_text()

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 
-from tests.test_deploy_cluster import KUBERNETES, KUBERNETES_VERSION, build
+from tests.test_deploy_cluster import KUBERNETES, KUBERNETES_VERSION, build, filled
 from v2v_protocol.errors import KeyRefused
 from v2v_protocol.keys import read_key
 from v2v_server.commands import serve as serve_command
@@ -48,12 +48,17 @@ def test_with_keys_the_manifests_build_and_the_broker_requires_them(
             validate.validate(document, KUBERNETES_VERSION, strict=True)
     asked: list[ServeConfig] = []
     monkeypatch.setattr("v2v_server.serve.serve", lambda config, *_: asked.append(config))
-    pods = {name: made["Deployment", name]["spec"]["template"]["spec"] for name in ("v2v-broker", "v2v-workers")}
+    of_broker = made["StatefulSet", "v2v-broker"]["spec"]
+    pods = {
+        "v2v-broker": of_broker["template"]["spec"],
+        "v2v-workers": made["Deployment", "v2v-workers"]["spec"]["template"]["spec"],
+    }
+    claims = {each["metadata"]["name"] for each in of_broker["volumeClaimTemplates"]}
     keys = KeyFolder(tmp_path / "keys")
     keys.init()
     arguments = pods["v2v-broker"]["containers"][0]["args"]
     assert "--keys=/keys" in arguments
-    here = [argument.replace("=/keys", f"={keys.path}") for argument in arguments]
+    here = [argument.replace("=/keys", f"={keys.path}") for argument in filled(arguments)]
     assert serve_command.main(here) == 0
     assert (asked[0].keys, asked[0].page_host) == (str(keys.path), "0.0.0.0")
     named = set()
@@ -61,7 +66,7 @@ def test_with_keys_the_manifests_build_and_the_broker_requires_them(
         volumes = {volume["name"]: volume for volume in spec["volumes"]}
         for each in [*spec["containers"], *spec["initContainers"]]:
             assert each["image"] == "registry.example/v2v-server:1"
-            assert {mount["name"] for mount in each["volumeMounts"]} <= set(volumes)
+            assert {mount["name"] for mount in each["volumeMounts"]} <= set(volumes) | claims
             assert each["securityContext"]["capabilities"] == {"drop": ["ALL"]}
         named |= {volume["secret"]["secretName"] for volume in volumes.values() if "secret" in volume}
     assert named == set(secrets()) - {"v2v-consumer-key"}

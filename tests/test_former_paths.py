@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from importlib import import_module
 
 import pytest
@@ -14,4 +16,7 @@ import pytest
     ],
 )
 def test_the_former_path_gives_the_same(former: str, now: str, name: str) -> None:
+    """However it is imported, and by a process that has imported nothing else: pickles name it."""
     assert getattr(import_module(former), name) is getattr(import_module(now), name)
+    program = f"import {former} as module\nfrom {former} import {name}\nassert module.{name} is {name}"
+    subprocess.run([sys.executable, "-c", program], check=True)

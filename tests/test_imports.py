@@ -6,7 +6,6 @@ import ast
 import subprocess
 import sys
 from functools import cache
-from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -60,8 +59,8 @@ PROTOCOL_MAY = {*sys.stdlib_module_names, "numpy", "msgpack", "v2v_protocol"}
 
 
 FLOORS = (
-    "system", "keys", "video", "simulation", "labels", "motion", "flow", "worlds", "store", "config", "corpus",
-    "schedule",
+    "system", "keys", "video", "simulation", "labels", "motion", "flow", "worlds", "store", "kinds", "config", "corpus",
+    "lease_memory", "corpus_words", "schedule",
     "quarantine", "sharing",
     "broker",
     "worker", "supervise", "status", "prepare", "page",
@@ -157,18 +156,56 @@ def test_server_folders_import_only_lower_folders() -> None:
     assert upward == set()
 
 
-@pytest.mark.parametrize("folder", ["v2v_server/simulation"])
-def test_no_file_imports_itself_by_way_of_others(folder: str) -> None:
-    """Imports in functions and for types count as well."""
-    files = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in modules(folder)}
-    files = {name.removesuffix(".__init__"): path for name, path in files.items()}
-    imports: dict[str, set[str]] = {name: set() for name in files}
-    for name, path in files.items():
-        for node in nodes_of(path.read_text("utf-8")):
-            if isinstance(node, ast.ImportFrom):
-                imports[name] |= {f"{node.module}.{each.name}" for each in node.names} | {str(node.module)}
-    own = folder.replace("/", ".")  # it offers what its files hold
-    TopologicalSorter({name: used & (files.keys() - {own}) for name, used in imports.items()}).prepare()
+def imports_by_module(files: dict[str, str]) -> dict[str, set[str]]:
+    """Return which of these modules each one imports, anywhere in it: functions and TYPE_CHECKING count as well.
+
+    A folder's own ``__init__`` that Python runs before a module does not count, nor the files that a registry loads by
+    names of its table.
+    """
+    graph: dict[str, set[str]] = {name: set() for name in files}
+    for name, source in files.items():
+        for node in nodes_of(source):
+            if isinstance(node, ast.Import):
+                graph[name] |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                whole = {alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+                graph[name] |= {full if full in files else str(node.module) for full in whole.values()}
+        graph[name] &= files.keys() - {name}
+    return graph
+
+
+def circles(graph: dict[str, set[str]]) -> list[set[str]]:
+    """Return the groups of modules that import each other, directly or through others of the group."""
+    reached: dict[str, set[str]] = {}
+    for name, targets in graph.items():
+        todo, reached[name] = [*targets], set()
+        while todo:
+            if (module := todo.pop()) not in reached[name]:
+                reached[name].add(module)
+                todo += graph[module]
+    groups = {frozenset(other for other in reached[name] if name in reached[other]) for name in graph}
+    return [set(group) for group in sorted(groups, key=sorted) if group]
+
+
+def test_a_circle_is_found_wherever_its_imports_stand() -> None:
+    files = {
+        "a": "def f():\n    from b import x",
+        "b": "if TYPE_CHECKING:\n    from c import d",
+        "c": "",
+        "c.d": "import a",
+        "e": "from c import d",
+    }
+    assert circles(imports_by_module(files)) == [{"a", "b", "c.d"}]
+    assert circles(imports_by_module(files | {"c.d": ""})) == []
+
+
+def test_no_modules_import_each_other() -> None:
+    files = {}
+    for package in PACKAGES:
+        for path in modules(package):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            files[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path.read_text("utf-8")
+    assert [sorted(group) for group in circles(imports_by_module(files))] == []
 
 
 @pytest.mark.parametrize(
@@ -183,6 +220,8 @@ def test_no_file_imports_itself_by_way_of_others(folder: str) -> None:
                 "prepare",
                 "quarantine",
                 "schedule",
+                "corpus_words",
+                "lease_memory",
                 "sharing",
                 "keys",
                 "serve",
@@ -201,6 +240,45 @@ def test_every_folder_documents_its_files(room: str) -> None:
     assert on_the_map == {path.stem for path in folder.glob("*.py")} - {"__init__"} | rooms
 
 
+BROKER = ROOT / "v2v_server" / "broker"
+PURE = {
+    "__future__", "bisect", "collections", "collections.abc", "dataclasses", "enum", "hashlib", "itertools", "math",
+    "statistics", "typing",
+    "v2v_protocol", "v2v_protocol.arena", "v2v_protocol.errors", "v2v_protocol.liveness", "v2v_protocol.messages",
+    "v2v_protocol.recipe", "v2v_protocol.sample", "v2v_protocol.spec",
+    "v2v_server.corpus.videos", "v2v_server.lease_memory", "v2v_server.schedule", "v2v_server.sharing",
+    "v2v_server.system.log",
+}  # fmt: skip
+"""What the broker may import: nothing here reads a file, but for the quarantine, of which it uses the values."""
+
+
+def broker_files() -> list[str]:
+    """Return the names of the broker's files in the order of its page: each imports only those above it."""
+    return [line.split()[0] for line in (BROKER / "__init__.py").read_text("utf-8").splitlines()[2:-1]]
+
+
+@pytest.mark.parametrize("file", broker_files())
+def test_the_broker_reads_no_file_and_imports_in_one_direction(file: str) -> None:
+    source = (BROKER / f"{file}.py").read_text("utf-8")
+    nodes = nodes_of(source, expressions=True)
+    above = {f"v2v_server.broker.{name}" for name in broker_files()[: broker_files().index(file)]}
+    from_quarantine: set[str] = set()
+    for node in nodes:
+        if isinstance(node, ast.ImportFrom) and node.module == "v2v_server.quarantine":
+            from_quarantine |= {alias.name for alias in node.names}
+    assert from_quarantine <= {"Quarantine", "QuarantineEntry"}
+    modules = modules_of(BROKER / f"{file}.py") - {"v2v_server.quarantine", "v2v_server.broker"}
+    assert modules - PURE - above == set()
+    packages = {
+        f"v2v_server.broker.{alias.name}"
+        for node in nodes
+        if isinstance(node, ast.ImportFrom) and node.module == "v2v_server.broker"
+        for alias in node.names
+    }
+    assert packages - above == set()
+    assert "open" not in {node.id for node in nodes if isinstance(node, ast.Name)}
+
+
 @pytest.mark.parametrize(
     ("module", "without"),
     [
@@ -208,6 +286,9 @@ def test_every_folder_documents_its_files(room: str) -> None:
         ("v2v_server.simulation.draw", ("torch", "zmq", "av", "numba", "cv2")),
         ("v2v_server.broker.dispatcher", ("torch", "zmq", "numba", "cv2")),
         ("v2v_server.serve", ("torch", "numba", "cv2")),
+        ("v2v_server.worker.process", ("torch", "v2v_server.corpus.index", "v2v_server.schedule")),
+        ("v2v_server.schedule", ("torch", "zmq", "numba", "cv2", "sqlite3")),
+        ("v2v_server.kinds.registry", ("torch", "zmq", "av", "numba", "cv2", "PIL")),
     ],
 )
 def test_what_a_fresh_interpreter_loads(module: str, without: tuple[str, ...]) -> None:
@@ -239,7 +320,7 @@ def test_no_two_classes_constants_or_aliases_have_one_name() -> None:
             for name, definition in (constants(nodes[0]) | classes).items():
                 if name[0].isupper():
                     found.setdefault(name, {})[str(path.relative_to(ROOT))] = definition
-    del found["LOOKED_FOR"]  # of each kind of pixels
+    del found["KIND"]  # of each kind of videos
     assert {
         name: list(used)
         for name, used in found.items()

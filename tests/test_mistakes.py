@@ -40,6 +40,7 @@ from v2v_protocol.settings import nearest, settings_of
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import recipe_setting
 from v2v_protocol.write_aside import write_json
+from v2v_recordings.writers import ENDINGS, write_events
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import list_corpus
 from v2v_server.corpus.sources.source import SourceOptions, open_source
@@ -47,7 +48,6 @@ from v2v_server.simulation.clip import simulate
 from v2v_server.simulation.kernels import Voxels
 from v2v_server.store.cache import make_cache
 from v2v_server.video.rows import Rows
-from v2v_tools.event_files import EVENT_WRITERS, write_events
 
 OUTPUTS = [
     ("v2v-preview a.mp4 --out a.mp4", ["--out a.mp4", "also reads"]),
@@ -183,7 +183,7 @@ OLDER = b"\x89PNG\r\n\x1a\nthe older file"
 WRITERS: dict[str, Callable[[Path], None]] = {
     ".png": _noise,
     ".json": lambda path: write_json(path, [{"key": "x" * 5000}]),
-    **dict.fromkeys(EVENT_WRITERS, _events),
+    **dict.fromkeys(ENDINGS, _events),
 }
 
 
@@ -397,6 +397,15 @@ IN_PYTHON: list[tuple[Callable[[], object], str]] = [
     (lambda: sample().cuda(), r"a Sample has no 'cuda'; its arrays are NumPy's"),
     (lambda: batch().cuda(), r"a Batch has no 'cuda'; write .to"),
     (lambda: batch().flow, r"create the dataset with arrays=\('voxels', 'flow'\)"),
+    (lambda: batch().to("float32"), r"batch.to\('float32'\): give a device, such as .*, or torch.float32"),
+    (lambda: batch().to(np.float32), r"give a device, such as .*, or torch.float32"),  # type: ignore[arg-type]
+    (lambda: batch().to("gpu"), r"batch.to\('gpu'\): give a device, such as .*, or a torch.dtype"),
+    (lambda: V2VStreamDataset.local("clips", rate=25), r'flag of v2v-serve: flags=\["--rate", "..."\]; known: videos'),
+    (lambda: V2VStreamDataset.local("clips", cache_gib=3), r'flags=\["--cache-gib", "..."\]'),
+    (lambda: V2VStreamDataset.local("clips", port=5555), r'flags=\["--bind", "..."\]'),
+    (lambda: V2VStreamDataset.local("clips", videos_kind="sequences"), r'flags=\["--videos-kind", "..."\]'),
+    (lambda: V2VStreamDataset.local("clips", threads=3), r"did you mean 'workers'"),
+    (lambda: V2VStreamDataset.local("clips", bins=3), r"it belongs to the recipe, recipe={'bins': ...}; known"),
 ]
 
 
@@ -421,6 +430,32 @@ def test_mistakes_in_python_are_named(number: int) -> None:
     mistake, words = IN_PYTHON[number]
     with pytest.raises((UsageError, AttributeError, KeyError), match=words):
         mistake()
+
+
+UNUSUAL = [
+    ({"threshold_pos": 20}, "threshold_pos = 20: real cameras have 0.01 to 5 log units. An event would need"),
+    ({"threshold_neg": 20}, "threshold_neg = 20: real cameras have 0.01 to 5 log units"),
+    (
+        {"noise_sigma": 5},
+        "noise_sigma = 5: real cameras have 0 to 1 log units. Noise would make .* Divide percent by 100",
+    ),
+    ({"leak_hz": 1000.0, "frames_per_second": 25}, "leak_hz = 1000: real cameras have"),
+    ({"refractory_seconds": 1, "frames_per_second": 25}, "refractory_seconds = 1: .* Divide milliseconds by 1000"),
+    ({"gamma": 0.1}, "gamma = 0.1: real cameras have"),
+    ({"log_eps": 1e-9}, "log_eps = 1e-09: .* fire at the least change"),
+    ({"noise_sigma": 0.5, "gamma": 1.0, "log_eps": 0.1, "hot_pixel_count": 1, "hot_pixel_sigma": 3}, None),
+]
+
+
+@pytest.mark.parametrize(("arguments", "words"), UNUSUAL, ids=str)
+def test_a_simulation_warns_of_values_that_no_camera_has(
+    arguments: dict[str, Any], words: str | None, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("v2v_protocol.recipe._WARNED", set())
+    for _ in range(2):
+        simulate(np.zeros((11, 8, 8), np.uint8), **{"threshold_pos": 0.2} | arguments)
+    assert len(caplog.messages) == (words is not None)
+    assert all(re.match(f"warning: {words}", said) for said in caplog.messages)
 
 
 def test_numbers_of_any_library_are_numbers_and_a_dtype_may_come_alone() -> None:

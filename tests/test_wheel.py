@@ -80,3 +80,11 @@ def test_a_first_picture(installed: Path, tmp_path: Path) -> None:
     write_clip(tmp_path / "clip.mp4", panned_luma(210, 160, 200))
     ran(installed / "v2v-preview", "clip.mp4", "--out", "sheet.png", cwd=tmp_path)
     assert (tmp_path / "sheet.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_module_of_the_users_own_named_trainer(installed: Path, tmp_path: Path) -> None:
+    """It comes first for the user's script, and the client and the commands do not see it."""
+    (tmp_path / "trainer.py").write_text("MINE = True\n", encoding="utf-8")
+    (tmp_path / "own.py").write_text("import trainer, v2v_client; print(trainer.MINE, v2v_client.V2VStreamDataset)\n")
+    assert ran(installed / "python", "own.py", cwd=tmp_path).startswith("True <class")
+    assert "network" in ran(installed / "v2v-train", "tiny-cpu", "--show-config", cwd=tmp_path)

@@ -145,12 +145,13 @@ class ComputeConfig:
 
     Attributes:
         device: "auto" takes a GPU if there is one.
-        precision: "float32" computes IEEE float32 on a GPU too; "tf32" allows TF32 in cuDNN convolutions, which is
-            PyTorch's default, and keeps matrix products IEEE; "bfloat16" runs convolutions under autocast, while
-            weights, sums of gradients, losses and pictures stay float32. Scores are IEEE float32 with all three.
+        precision: "tf32" allows TF32 in a GPU's convolutions, as PyTorch does by itself; matrix products stay IEEE, as
+            all products on a processor. "float32" computes IEEE float32 on a GPU too. "bfloat16" runs convolutions
+            under autocast, while weights, sums of gradients, losses and pictures stay float32. Scores are IEEE float32
+            with all three.
         cudnn_benchmark: let cuDNN time its convolution algorithms and use the fastest; shapes are constant in a run.
         pieces: parts of a batch that are computed one after another; their gradients are added, which saves memory.
-        channels_last: use that memory format for the network.
+        channels_last: use that memory format for the network; "auto": see :func:`trainer.learner.channels_last`.
         compile: what ``torch.compile`` compiles: "step" one iteration of each loop over time or over updates, in
             seconds, with PyTorch 2.7 or later; "clip" the network over the whole clip, unrolled, in minutes.
         cuda_graph: run forward and backward of a step as one CUDA graph, see :mod:`trainer.captured`.
@@ -160,15 +161,21 @@ class ComputeConfig:
     """
 
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    precision: Literal["float32", "tf32", "bfloat16"] = "float32"
+    precision: Literal["float32", "tf32", "bfloat16"] = "tf32"
     cudnn_benchmark: bool = True
     pieces: int = limited(1, 1, 65_536)
-    channels_last: bool = False
+    channels_last: Any = "auto"
     compile: Literal["none", "step", "clip"] = "none"
     cuda_graph: bool = False
     threads: int = limited(0, 0, 1024)
     seed: int = limited(0, 0, 2**63 - 1)
     group_timeout_seconds: float = limited(7200.0, 1, 1e7)
+
+    def __post_init__(self) -> None:
+        if self.channels_last != "auto" and not isinstance(self.channels_last, bool):
+            raise UsageError(
+                f"compute.channels_last = {format_value(self.channels_last)}: give true, false or auto (default)"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -21,18 +21,19 @@ def shipped() -> list[str]:
     return sorted(entry.name.removesuffix(".yaml") for entry in folder.iterdir() if entry.name.endswith(".yaml"))
 
 
-def load_config(file: str, settings: Sequence[str] = ()) -> TrainConfig:
+def load_config(file: str, settings: Sequence[str] = (), base: Mapping[str, Any] | None = None) -> TrainConfig:
     """Read a configuration.
 
     Args:
         file: YAML, or the name of a shipped configuration. ``extends: other.yaml`` (beside the file, or the name of a
             shipped one) starts from that one, so that the file holds only what differs.
         settings: "key=value" texts, keys with their section, values in YAML; they override the file.
+        base: nested values to take where neither says anything, instead of the defaults.
 
     Raises:
         UsageError: a file cannot be read, a setting is malformed, or see :class:`trainer.config.TrainConfig`.
     """
-    values = _read(file)
+    values = _merged(base or {}, _read(file))
     for setting in settings:
         _set(values, setting)
     return TrainConfig.from_dict(values)

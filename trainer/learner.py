@@ -146,7 +146,7 @@ def build(config: TrainConfig, ranks: Ranks) -> Learner:
     _set_numerics(compute)
     torch.manual_seed(compute.seed)
     network = _network(config)
-    if compute.channels_last:
+    if channels_last(compute, ranks.device):
         network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     network = network.to(ranks.device)
     task = TASKS[network.task](config.loss, network, ranks.device, bfloat16=compute.precision == "bfloat16")
@@ -168,6 +168,17 @@ def build(config: TrainConfig, ranks: Ranks) -> Learner:
     if compute.cuda_graph:
         learner = replace(learner, captured=CapturedGradients(learner.gradients))
     return learner
+
+
+def channels_last(compute: ComputeConfig, device: torch.device) -> bool:
+    """Return whether the network is kept in channels-last format.
+
+    "auto": on a processor, where it is faster (``python -m bench step``); on a GPU with "tf32" and "bfloat16", whose
+    units (tensor cores) work in that format.
+    """
+    if compute.channels_last == "auto":
+        return device.type != "cuda" or compute.precision != "float32"
+    return bool(compute.channels_last)
 
 
 def learning_rate(config: OptimizerConfig, run: RunConfig, step: int, epoch: int) -> float:

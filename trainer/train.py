@@ -17,7 +17,16 @@ from trainer.config_file import load_config, shipped, show_config
 from trainer.feed import flags_of
 from trainer.learner import build, obeying_weights
 from trainer.loop import Diverged, train
-from trainer.run.checkpoint import LAST, Checkpoint, load_checkpoint, require_fresh, require_same_run, require_writable
+from trainer.run import data, export
+from trainer.run.checkpoint import (
+    LAST,
+    Checkpoint,
+    load_checkpoint,
+    numerics_of,
+    require_fresh,
+    require_same_run,
+    require_writable,
+)
 from trainer.run.distributed import Ranks, ranks
 from trainer.run.interruption import StopRequest
 from trainer.run.reporting import CONFIGURATION
@@ -42,6 +51,8 @@ def _parser() -> Parser:
             "v2v-train e2vid --videos webvid10k/ --workers 8 --out runs/e2vid",
             "v2v-train my.yaml --connect tcp://127.0.0.1:5555 --set optimizer.learning_rate=1e-4",
             "torchrun --nproc-per-node 4 -m trainer.train e2vid --connect tcp://head:5555",
+            "v2v-train data firenet-cpu",
+            "v2v-train export --help",
         ],
         "Exit status: 0 trained to the end, 1 diverged, 2 wrong usage or input, full disk or no server, 128 + N ended "
         f"and saved after signal N.\nShipped configurations: {', '.join(shipped())}.\nKeys: {keys()}",
@@ -183,12 +194,12 @@ def run(arguments: argparse.Namespace) -> int:
     Raises:
         V2VError: see :func:`load_config`, :func:`trainer.learner.build` and :func:`trainer.loop.train`.
     """
-    config = load_config(arguments.config, _settings(arguments))
+    resume = None if arguments.resume is None else load_checkpoint(arguments.resume)
+    config = load_config(arguments.config, _settings(arguments), None if resume is None else numerics_of(resume))
     if arguments.show_config:
         print(show_config(config), end="")
         return 0
-    resume = None
-    if arguments.resume is None:
+    if resume is None:
         config = obeying_weights(config)
         out = Path(config.run.out or f"runs/{Path(arguments.config).stem}")
         require_fresh(out)
@@ -200,7 +211,6 @@ def run(arguments: argparse.Namespace) -> int:
         out = Path(config.run.out or begun_in)
         if out.resolve() != begun_in.resolve():
             require_fresh(out)
-        resume = load_checkpoint(arguments.resume)
         config = config.with_network_options(resume.config["network"]["options"], weights="")
         for change in require_same_run(resume, config):
             print(f"v2v-train: changed since the checkpoint: {change}", file=sys.stderr)
@@ -221,7 +231,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit status."""
+    """Run the command line; return the exit status. ``export`` and ``data`` are commands of their own."""
+    given = sys.argv[1:] if argv is None else argv
+    for word, other in (("export", export.main), ("data", data.main)):
+        if given[:1] == [word]:
+            return other(given[1:])
     return run_command(_parser(), run, argv, failures=(Diverged,), interrupted="interrupted before the first step")
 
 

@@ -8,7 +8,7 @@ for batch in V2VStreamDataset("tcp://127.0.0.1:5555", batch_size=12):
 Modules:
 
     dataset       the dataset; batch: what it yields; delivery: samples to batches; options: what a consumer may request
-    mixture       batches of several datasets in a fixed order
+    mixture       the order of the batches of several datasets, pure
     conversation  the protocol, pure (states, messages, times); connection: runs it over a link
     memory        arenas (workers of this host write there), slots (which sample has which row), buffers (reused)
     position      which samples a consumer gets, and the state that is saved; passes: shared with loader workers
@@ -18,9 +18,13 @@ Modules:
     loadtest      the load test; local_server: a server as a subprocess
 """
 
+import sys
+from types import ModuleType
+
 from v2v_protocol.programs import name_extra
 
 try:
+    from v2v_client import options
     from v2v_client.batch import Batch
     from v2v_client.dataset import V2VStreamDataset
     from v2v_client.in_process import V2VDataset
@@ -43,6 +47,11 @@ from v2v_protocol.errors import (
     V2VError,
     VersionMismatch,
 )
+
+# Where Patience was in release 0.2.0. Python asks for a module's package first.
+session = ModuleType("v2v_client.session")
+vars(session)["liveness"] = options
+sys.modules |= {"v2v_client.session": session, "v2v_client.session.liveness": options}
 
 __all__ = [
     "Batch",

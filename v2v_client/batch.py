@@ -148,6 +148,7 @@ class Batch(Drawn):
     frames            [B, T + lead_frames, 1, H, W] uint8, the simulated pixels
     frames_rgb        [B, T + lead_frames, 3, H, W] uint8, red, green and blue
     frames_u16        [B, T + lead_frames, 1, H, W] uint16, with the levels that the video stores
+    frames_blurred    [B, T + lead_frames, 1, H, W] uint8, the frames exposed for ``exposure_seconds`` of the recipe
     frames_all        [B, steps + 1, 1, H, W] uint8, all frames that were simulated, the first included
     flow              [B, T, 2, H, W] float16, (x, y) px; flow[:, t] belongs to voxel t of the target sequence, and is
                       zero before ``flow_from``
@@ -248,7 +249,11 @@ class Batch(Drawn):
         return sum(tensor.nbytes for tensor in self.arrays.values())
 
     def pin_memory(self) -> Batch:
-        """Return a copy in page-locked memory. ``DataLoader(pin_memory=True)`` calls this."""
+        """Return a copy in page-locked memory; this batch itself where there is no CUDA device, which alone copies
+        faster from such memory. ``DataLoader(pin_memory=True)`` calls this.
+        """
+        if not torch.cuda.is_available():
+            return self
         return dataclasses.replace(self, arrays={name: tensor.pin_memory() for name, tensor in self.arrays.items()})
 
     def to(
@@ -266,10 +271,17 @@ class Batch(Drawn):
                 this batch is dropped.
 
         Raises:
-            UsageError: ``dtype`` is no dtype.
+            UsageError: ``device`` is no device, or ``dtype`` no dtype.
         """
         if not isinstance(dtype, torch.dtype | None):
             raise UsageError(f"batch.to({device!r}, {dtype!r}): give a torch.dtype, or non_blocking=True by its name")
+        if not isinstance(device, torch.device | torch.dtype | int | None):
+            try:
+                torch.device(device)
+            except (RuntimeError, TypeError) as error:
+                name = getattr(device, "__name__", str(device))
+                meant = f"torch.{name}" if isinstance(getattr(torch, name, None), torch.dtype) else "a torch.dtype"
+                raise UsageError(f'batch.to({device!r}): give a device, such as "cuda" or "cpu", or {meant}') from error
 
         def move(item: torch.Tensor) -> torch.Tensor:
             # PyTorch keeps page-locked memory until the copy is done, but does not track this library's memory.

@@ -50,7 +50,7 @@ class Connection:
 
     Args:
         address: ``tcp://host:port``, or several in the order in which they are tried. If one is silent for
-            ``patience.takeover_seconds``, or has no worker, the next takes over.
+            ``patience.takeover_seconds``, the next takes over. They share their workers, so a lack of those ends it.
         hello: the first message, with the requested spec and arrays.
         epoch: epoch of the samples to request.
         pinned: the stream that the server must offer; None accepts any.
@@ -200,19 +200,13 @@ class Connection:
     def _step(self, *, wait: bool) -> tuple[Arrival | None, bool]:
         """Run due timers, then handle one message. Return (a sample, if one arrived; whether no message came)."""
         if len(self._brokers) > 1 and self.conversation.silence(self._now()) >= self._patience.takeover_seconds:
-            self._take_over("silent")
-        try:
-            arrival, idle = self._exchange(wait=wait)
-        except ServerLost as lost:
-            if self._link is None or len(self._brokers) == 1:
-                raise
-            self._take_over(str(lost))
-            return None, False
+            self._take_over()
+        arrival, idle = self._exchange(wait=wait)
         if arrival is not None:
             self._moves, self._last_sample = 0, self._now()
         return arrival, idle
 
-    def _take_over(self, reason: str) -> None:
+    def _take_over(self) -> None:
         """Switch to the next broker and send it all unanswered requests. Brokers need no state of this consumer.
 
         Raises:
@@ -221,13 +215,13 @@ class Connection:
         now, waited = self._now(), self._now() - self._last_sample
         if self._moves >= len(self._brokers) - 1 and waited >= self._patience.timeout_seconds:
             raise ServerLost(
-                f"{', '.join(self._brokers)}: no sample for {waited:.0f} s; the last broker: {reason}; start "
-                f"v2v-serve there, or wait longer with timeout_seconds (now {self._patience.timeout_seconds:g})"
+                f"{', '.join(self._brokers)}: no sample for {waited:.0f} s, and all are silent; start v2v-serve "
+                f"there, or wait longer with timeout_seconds (now {self._patience.timeout_seconds:g})"
             )
         self._moves += 1
         lost = self.address
         self.address = self._brokers[(self._brokers.index(lost) + 1) % len(self._brokers)]
-        _log.warning("%s: %s; %s takes over", lost, reason, self.address)
+        _log.warning("%s: silent; %s takes over", lost, self.address)
         old, self._link = self._open_link(), self._transport(self.address)
         old.close()
         self._link.connect(self._largest_frame_bytes)
@@ -354,21 +348,6 @@ class Connector:
                 _log.warning("cannot compare %s with %s before it takes over: %s", connection.address, broker, lost)
                 continue
             return
-
-
-def addresses(given: str | Sequence[str]) -> tuple[str, ...]:
-    """Return the addresses of a list or of a comma-separated text.
-
-    Raises:
-        UsageError: there is no address, or one occurs twice.
-    """
-    texts = given.split(",") if isinstance(given, str) else given if isinstance(given, Sequence) else ()
-    found = tuple(str(text).strip() for text in texts)
-    if not found or not all(found):
-        raise UsageError(f"address {given!r}: give tcp://host:port, or several of them")
-    if len(set(found)) < len(found):
-        raise UsageError(f"address {given!r}: a broker occurs twice; give each once")
-    return found
 
 
 def order(brokers: Sequence[str], consumer: int, consumers: int) -> tuple[str, ...]:

@@ -9,30 +9,29 @@ import os
 import warnings
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
-from typing import TYPE_CHECKING, Any, Never, Self
+from contextlib import ExitStack, closing, contextmanager
+from typing import Any, Never, Self
 
+import numpy as np
 from torch.utils.data import IterableDataset, get_worker_info
 
 from v2v_client.batch import Batch
-from v2v_client.connection import Connection, Connector, addresses
+from v2v_client.connection import Connection, Connector
 from v2v_client.delivery import deliver
 from v2v_client.loaders import distributed_rank, end_with_parent, send_before_exit
 from v2v_client.local_server import LocalServer, server_flags
 from v2v_client.memory import BatchBuffers
+from v2v_client.mixture import MixtureConsumer, read_weights
 from v2v_client.options import Fixed, Labels, Options, Patience, check_labels, require_arguments, require_labels
 from v2v_client.passes import Iteration, Position
 from v2v_client.position import Consumer, EpochPlan, ResumeState, StreamIdentity
 from v2v_protocol.errors import RepeatedSamplesWarning, StateMismatch, UsageError
-from v2v_protocol.keys import leaves_host
+from v2v_protocol.keys import addresses, leaves_host
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_INDEX, LARGEST_SEED, html_table
-from v2v_protocol.settings import require_whole
+from v2v_protocol.settings import format_value, require_whole
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import read_recipe
-
-if TYPE_CHECKING:
-    from v2v_client.mixture import Mixture
 
 _NOT_SHARED = (
     "samples of one decode go to different ranks or loader workers here, so each is decoded separately: the stream was "
@@ -236,8 +235,6 @@ class V2VStreamDataset(Fixed, IterableDataset[Batch]):
         Raises:
             UsageError: the weights are not shares, or the datasets do not fit together.
         """
-        from v2v_client.mixture import Mixture  # which imports this module
-
         return Mixture(weights, seed)
 
     def close(self) -> None:
@@ -389,8 +386,8 @@ class V2VStreamDataset(Fixed, IterableDataset[Batch]):
                 workers and (for a rank's state) world size.
 
         Raises:
-            StateMismatch: the state belongs to another seed or spec.
-            UsageError: it is not a state, or a loader worker's state that this process cannot use.
+            StateMismatch: the state belongs to another seed or spec, or is none of this release.
+            UsageError: it is no mapping, or a loader worker's state that this process cannot use.
         """
         self._require_open()
         self._position.load(self._read_state(state), self._consumer)
@@ -486,3 +483,113 @@ class V2VStreamDataset(Fixed, IterableDataset[Batch]):
                 yield batch
                 self._require_open()
         self._position.finish(begun)
+
+
+class Mixture(V2VStreamDataset):
+    """Stream the batches of several datasets in the order of :mod:`v2v_client.mixture`; see
+    :meth:`V2VStreamDataset.mix`.
+
+    Attributes:
+        members: the datasets; closing the mixture closes them. Iterate only the mixture.
+
+    Raises:
+        UsageError: the weights are not shares, or the datasets do not fit together.
+    """
+
+    def __init__(self, weights: Mapping[V2VStreamDataset, float | Sequence[float]], seed: int) -> None:
+        if not isinstance(weights, Mapping):
+            raise UsageError(
+                f"mix: {format_value(weights)}: give a dict of datasets with their weights, "
+                "V2VStreamDataset.mix({first: 0.7, second: 0.3})"
+            )
+        for each in weights:
+            if not isinstance(each, V2VStreamDataset) or isinstance(each, Mixture):
+                hint = (
+                    f"V2VStreamDataset({each!r}, ...)"
+                    if isinstance(each, str)
+                    else "a V2VStreamDataset that is no mixture"
+                )
+                raise UsageError(f"mix: {format_value(each)} is no dataset to mix: give {hint}")
+        self.members = members = tuple(weights)
+        self._weights = read_weights(weights.values())
+        for number, member in enumerate(members):
+            if any(member._samples() == other._samples() for other in members[:number]):
+                raise UsageError(
+                    f"mix: {member!r} is a member twice, so its samples would come twice: give one weight, or "
+                    "another seed, recipe or address"
+                )
+        for name in ("arrays", "batch_size", "rank", "world_size"):
+            values = [member._settings()[name] for member in members]
+            if any(value != values[0] for value in values):
+                raise UsageError(f"mix: the datasets have {name} = {', '.join(map(str, values))}; give all the same")
+        self._seed = require_whole("seed", seed, 0, LARGEST_SEED)
+        self._explicit, self._ambient = members[0]._explicit, members[0]._ambient
+        self._position = Position(seed, members[0].epoch)
+        self._offered, self._is_closed = None, False
+        self._stop_server = lambda: [member.close() for member in members]  # type: ignore[func-returns-value]  # self would stay
+
+    def _settings(self) -> dict[str, Any]:
+        settings = [member._settings() for member in self.members]
+        address = " + ".join(each["address"] for each in settings)
+        return settings[0] | {"address": address, "seed": self._seed, "weights": self._weights}
+
+    @property
+    def _consumer(self) -> MixtureConsumer:
+        batch_size = self.members[0]._consumer.batch_size
+        return MixtureConsumer(batch_size, self.rank, self.world_size, self._seed, self._weights)
+
+    def _ask_stream(self, start: ResumeState) -> StreamIdentity:
+        return self._consumer.identity([member._ask_stream(start) for member in self.members])
+
+    def _check(self, state: ResumeState, stream: StreamIdentity) -> StreamIdentity:
+        streams = self._consumer.members_of(state, stream, len(self.members))
+        for member, each in zip(self.members, streams, strict=True):
+            member._check(state, each)
+        return self._consumer.identity(streams)
+
+    @contextmanager
+    def _opened(self, begun: Iteration) -> Iterator[tuple[Any, Iteration, EpochPlan]]:
+        pinned = begun.state.stream
+        streams = (
+            [None] * len(self.members) if pinned is None else map(StreamIdentity.from_dict, pinned.spec["members"])
+        )
+        with ExitStack() as stack:
+            connections = []
+            for member, stream, snapshot in zip(self.members, streams, self._snapshots(begun.state), strict=True):
+                start = dataclasses.replace(begun.state, stream=stream, quarantine=snapshot)
+                connections.append(stack.enter_context(member._connected(start, begun.workers)))
+            forms = {each.address: each.conversation.layout for each in connections}
+            if any(each.conversation.layout != connections[0].conversation.layout for each in connections):
+                raise UsageError(f"mix: samples differ in form, {forms}: give recipes of one size, and one voxel_dtype")
+            stream = self._consumer.identity([each.conversation.stream for each in connections])
+            begun = self._position.pin(begun, stream, "this mixture")
+            consumer, needed = self._consumer, self.world_size * self.members[0]._consumer.batch_size
+            for each, weight in zip(connections, consumer.shares(begun.state.epoch), strict=True):
+                if weight and each.conversation.stream.sequences < needed:
+                    raise UsageError(
+                        f"mix: {each.address} gives {each.conversation.stream.sequences} sequences, and a batch of all "
+                        f"ranks needs {needed}: use a smaller batch_size, fewer ranks or more videos"
+                    )
+            yield connections, begun, consumer.plan(stream, begun.state)
+
+    def _snapshots(self, state: ResumeState) -> list[int | None]:
+        return [*state.quarantine] if isinstance(state.quarantine, list | tuple) else [None] * len(self.members)
+
+    def _take(self, connections: Any, begun: Iteration, plan: EpochPlan, batches: Sequence[int]) -> Iterator[Batch]:
+        consumer, state, snapshots = self._consumer, begun.state, self._snapshots(begun.state)
+        order = consumer.order(state.stream, state.epoch)  # type: ignore[arg-type]  # it was pinned
+        places = plan.position // plan.batch_size + np.array(batches, np.int64)
+        taken = [
+            member._take(
+                connection,
+                begun,
+                member._consumer.plan(connection.conversation.stream, state.at_epoch(state.epoch)),
+                np.flatnonzero(np.isin(np.flatnonzero(order == number), places)).tolist(),
+            )
+            for number, (member, connection) in enumerate(zip(self.members, connections, strict=True))
+        ]
+        for batch_number, number in zip(batches, order[places].tolist(), strict=True):
+            batch = next(taken[number])
+            snapshots[number] = batch.resume_state["quarantine"]
+            after = consumer.after(state, plan, batch_number, tuple(snapshots))
+            yield dataclasses.replace(batch, resume_state=after.to_dict())

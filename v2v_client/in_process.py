@@ -105,7 +105,11 @@ class V2VDataset(Fixed, Dataset[Sample]):
         self.spec = StreamSpec.from_dict({**options, "recipe": read_recipe(recipe)})
         self.spec.recipe.warn()
         self._arrays = (arrays,) if isinstance(arrays, str) else tuple(arrays)
-        self._videos, self._kind = require_videos(videos), (videos_kind, rate, photograph_seconds, picture_bits)
+        self._videos = require_videos(videos)
+        self._kind = {
+            "videos_kind": videos_kind, "rate": rate, "photograph_seconds": photograph_seconds,
+            "picture_bits": picture_bits,
+        }  # fmt: skip
         self._source = {"rows": rows, "list_file": list_file, "cache_dir": cache_dir}
         self._maker: Any = None
         self._process = 0
@@ -192,7 +196,7 @@ class V2VDataset(Fixed, Dataset[Sample]):
             except ModuleNotFoundError as error:
                 needs = "V2VDataset, which makes samples in this process,"
                 raise UsageError(name_extra(needs, error.name or "", "server")) from error
-            kind = remake.VideosKind(*self._kind)
+            kind = importlib.import_module("v2v_server.kinds.registry").kind_from(self._kind)
             self._maker = remake.open_remaker(
                 self._videos, **self._source, kind=kind, spec=self.spec, arrays=self._arrays
             )

@@ -130,7 +130,11 @@ def require_arguments(function: Callable[..., Any], options: Mapping[str, Any]) 
     for name in options:
         if name not in SPEC_KEYS:
             hint = f": it belongs to the recipe, recipe={{{name!r}: ...}}" if name in settings_of(Recipe) else ""
-            raise UsageError(f"no argument {name!r}{hint or nearest(name, known)}; known: {', '.join(known)}")
+            hint = hint or nearest(name, known)
+            if "flags" in named and hint in ("", nearest("flags", known)):
+                flag = "--bind" if name == "port" else f"--{name.replace('_', '-')}"
+                hint = f'; if it is a flag of v2v-serve: flags=["{flag}", "..."]'
+            raise UsageError(f"no argument {name!r}{hint}; known: {', '.join(known)}")
 
 
 def require_videos(videos: str | os.PathLike[str]) -> str:

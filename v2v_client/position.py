@@ -198,12 +198,13 @@ class ResumeState(Persisted):
         """Return the state that :meth:`to_dict` wrote.
 
         Raises:
-            UsageError: the values are not a state of this release; the message names field, value and limit.
+            StateMismatch: the values are not a state of this release; the message names field, value and limit.
+            UsageError: they are no mapping.
         """
         values = plain(values)
         if not isinstance(values, Mapping) or values.get("version") != STATE_VERSION:
             found = f"version {values.get('version')!r}" if isinstance(values, Mapping) else format_value(values)
-            raise UsageError(
+            raise (StateMismatch if isinstance(values, Mapping) else UsageError)(
                 f"not a state of V2VStreamDataset: {found}, expected version {STATE_VERSION}. Give the saved "
                 "Batch.resume_state itself, for instance torch.load('last.pt')['stream']"
             )
@@ -214,7 +215,7 @@ class ResumeState(Persisted):
         try:
             return read_fields(cls, fields)
         except ProtocolError as error:
-            raise UsageError(f"not a state of V2VStreamDataset: {error}") from error
+            raise StateMismatch(f"not a state of V2VStreamDataset: {error}") from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,7 +230,8 @@ class EpochPlan:
         position: local samples that this rank has consumed before the first batch of the plan.
 
     Raises:
-        UsageError: a number is outside its range.
+        StateMismatch: the position is outside the epoch.
+        UsageError: another number is outside its range.
     """
 
     sequences: int
@@ -246,9 +248,9 @@ class EpochPlan:
             raise UsageError(f"batch_size = {self.batch_size}: give 1 or more")
         consumed = self.origin + self.position * self.world_size
         if min(self.origin, self.position) < 0 or consumed > self.sequences:
-            raise UsageError(
+            raise StateMismatch(
                 f"position {self.position} of {self.world_size} ranks from global index {self.origin} is outside an "
-                f"epoch of {self.sequences} sequences"
+                f"epoch of {self.sequences} sequences: give the saved state unchanged"
             )
 
     @property

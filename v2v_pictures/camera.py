@@ -59,6 +59,7 @@ class Camera:
         boxes: [T, n, 7], see ``v2v_protocol.sample.BOX_COLUMNS``, or None.
         masks: [T, H, W] uint8, classes, or None.
         tracks: [T, N, 3], see ``v2v_protocol.sample.TRACK_COLUMNS``, or None.
+        blurred: [T, H, W] uint8, the frames exposed for a time, or None.
         step_seconds: time between two frames that the pixels see; 0 or NaN where it is unknown.
     """
 
@@ -74,6 +75,7 @@ class Camera:
     boxes: npt.NDArray[Any] | None = None
     masks: npt.NDArray[np.uint8] | None = None
     tracks: npt.NDArray[Any] | None = None
+    blurred: npt.NDArray[np.uint8] | None = None
     step_seconds: float = 0.0
 
     @classmethod
@@ -101,7 +103,7 @@ class Camera:
         if recipe is not None and recipe.grids_per_frame:
             voxels = voxels.reshape(-1, recipe.grids_per_frame * recipe.bins, *voxels.shape[2:])
         count = min(len(array) for array in (voxels, frames, flow) if array is not None)
-        boxes, masks, tracks = (arrays.get(name) for name in ("boxes", "masks", "tracks"))
+        boxes, masks, tracks, blurred = (arrays.get(name) for name in ("boxes", "masks", "tracks", "frames_blurred"))
         return cls(
             voxels[len(voxels) - count :],
             np.asarray(frames[len(frames) - count :]),
@@ -114,7 +116,16 @@ class Camera:
             boxes=None if boxes is None else np.asarray(boxes[len(boxes) - count :]),
             masks=None if masks is None else np.asarray(masks[len(masks) - count :, 0]),
             tracks=None if tracks is None else np.asarray(tracks[len(tracks) - count :]),
+            blurred=None if blurred is None else np.asarray(blurred[len(blurred) - count :, 0]),
         )
+
+    def picture(self, grid: int) -> npt.NDArray[np.uint8]:
+        """Return the frame of a voxel grid, [H, W]; if it is known exposed too, that as its right half."""
+        picture: npt.NDArray[np.uint8] = self.frames[grid].copy()
+        if self.blurred is not None:
+            half = picture.shape[1] // 2
+            picture[:, half:] = self.blurred[grid, :, half:]
+        return picture
 
     @property
     def crop(self) -> tuple[float, float, float, float]:

@@ -81,7 +81,7 @@ def _draw_camera(page: Canvas, camera: Camera, place: int, top: int, number: int
     page.text(left[0], top, "video frame", size=canvas.HEADING_PT)
     events_heading(page, left[1], top, "events:")
     top += _NAMES_PX
-    labelled_panel(page, camera, grid, left[0], top, draw_grey(camera.frames[grid]), tile_px, with_text=True)
+    labelled_panel(page, camera, grid, left[0], top, draw_grey(camera.picture(grid)), tile_px, with_text=True)
     events = draw_events(camera.voxels[grid, bin_], scale.full)
     labelled_panel(page, camera, grid, left[1], top, events, tile_px)
     if camera.paused[number]:

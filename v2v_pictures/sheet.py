@@ -433,7 +433,9 @@ def _camera_line(page: Canvas, camera: Camera, number: int, picks: Sequence[int]
 
 
 def _moment(page: Canvas, camera: Camera, pick: int, scale: Scale, left: list[int], y: int, tile_px: int) -> None:
-    labelled_panel(page, camera, pick, left[0], y, draw_grey(camera.frames[pick]), tile_px, with_text=True)
+    labelled_panel(page, camera, pick, left[0], y, draw_grey(camera.picture(pick)), tile_px, with_text=True)
+    if camera.blurred is not None:
+        label(page, left[0] + 5, y + 5, "sharp | exposed")
     bins = camera.voxels.shape[1]
     for number in range(min(bins, MOST_BINS)):
         events = draw_events(camera.voxels[pick, number], scale.full)

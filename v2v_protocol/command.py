@@ -116,8 +116,8 @@ class Parser(argparse.ArgumentParser):
                 check_output(flag, path, endings, taken)
                 taken.append(path)
         for name in _FOLDERS:
-            if name not in self._outputs:
-                check_outside(flag_of(name), getattr(arguments, name, None) or "", taken)
+            if name not in self._outputs and isinstance(folder := getattr(arguments, name, None), str | Path):
+                check_outside(flag_of(name), folder, taken)
 
     def format_help(self) -> str:
         """Format the help; options that every command has come last."""

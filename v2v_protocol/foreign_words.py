@@ -24,6 +24,7 @@ _MEANT = {
     "epochs num_epochs": ("v2v-train --set run.epochs=N",),
     "steps": ("v2v-train --set run.steps=N",),
     "checkpoint": ("resume", "weights"),
+    "videos_kind": ("flags",),
     # inputs and outputs, also of v2e and of OpenEB
     "input i input_path input_file path": ("videos", "data", _NO_FLAG),
     "data dataset data_dir root root_dir folder": ("videos", "data"),

@@ -1,4 +1,4 @@
-"""Read and use the key of a consumer or a worker.
+"""Read and use the key of a consumer or a worker; which addresses there are, and which leave this host.
 
 `v2v-keys new` writes a key file. It is JSON: the side it is for, a name, the server's public key, and a key pair of its
 own. It serves one side only: the server keeps consumers' and workers' keys apart. ``ipc://`` addresses use no keys:
@@ -12,11 +12,12 @@ import json
 import os
 import stat
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
-from v2v_protocol.errors import KeyRefused, ProtocolError
+from v2v_protocol.errors import KeyRefused, ProtocolError, UsageError
 from v2v_protocol.persisted import Persisted, parse_json
 
 SIDES = ("consumer", "worker")
@@ -132,6 +133,21 @@ def nameless_key(key: PeerKey) -> IO[bytes]:
     file.write(json.dumps(key.to_dict()).encode())
     file.flush()
     return file
+
+
+def addresses(given: str | Sequence[str]) -> tuple[str, ...]:
+    """Return the addresses of a list or of a comma-separated text.
+
+    Raises:
+        UsageError: there is no address, or one occurs twice.
+    """
+    texts = given.split(",") if isinstance(given, str) else given if isinstance(given, Sequence) else ()
+    found = tuple(str(text).strip() for text in texts)
+    if not found or not all(found):
+        raise UsageError(f"address {given!r}: give tcp://host:port, or several of them")
+    if len(set(found)) < len(found):
+        raise UsageError(f"address {given!r}: a broker occurs twice; give each once")
+    return found
 
 
 def is_loopback(host: str) -> bool:

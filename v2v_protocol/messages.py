@@ -60,11 +60,16 @@ class Notes(Persisted):
         reason: of a Goodbye: why a worker cannot work for this server; "": it just leaves.
         state: of a Lease: numbers that the file's size and times had when it was catalogued. A worker whose file has
             them need not read all of it; empty: not known.
+        credit: of a worker's Ping: leases that it takes at a time from now on; 0: no change.
+        catalogue, spec: of a Pong to a worker: digests of the catalogue and of the spec that consumers get by default.
     """
 
     memory_bytes: int = later(0)
     reason: str = later("")
     state: tuple[int, ...] = later(())
+    credit: int = later(0)
+    catalogue: str = later("")
+    spec: str = later("")
 
     @classmethod
     def from_dict(cls, values: Any) -> Notes:

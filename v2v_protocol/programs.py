@@ -5,15 +5,19 @@ steer a terminal.
 
 from __future__ import annotations
 
+import json
 import os
 import re
+import shlex
 import signal
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TextIO
+from urllib.parse import unquote, urlsplit
 
 from v2v_protocol import NUMERICS_VERSION, PROTOCOL_VERSION, __version__
 from v2v_protocol.settings import nearest
@@ -89,8 +93,29 @@ def name_extra(needs: str, package: str, extra: str) -> str:
     """
     return (
         f"{needs} needs the Python package {package.partition('.')[0]}, which is not installed; the extra '{extra}' "
-        f"brings it: pip install '.[{extra}]' in a checkout of v2v-stream"
+        f"brings it: {install_line(extra)}"
     )
+
+
+def install_line(extras: str) -> str:
+    """Return the command that installs extras of this distribution, from where it was installed: a package index, a
+    wheel or a checkout (``direct_url.json`` of PEP 610).
+
+    Args:
+        extras: names of extras, with commas between them.
+    """
+    from importlib import metadata  # only an error needs it, and it imports much
+
+    wanted = f"v2v-stream[{extras}]"
+    with suppress(metadata.PackageNotFoundError):
+        origin = json.loads(metadata.distribution("v2v-stream").read_text("direct_url.json") or "{}")
+        if origin.get("dir_info", {}).get("editable"):
+            folder = unquote(urlsplit(origin["url"]).path)
+            return f"pip install --editable {shlex.quote(f'{folder}[{extras}]')}"
+        if origin:
+            system = origin.get("vcs_info", {}).get("vcs")
+            wanted += f" @ {system}+{origin['url']}" if system else f" @ {origin['url']}"
+    return f"pip install {shlex.quote(wanted)}"
 
 
 def version_of(name: str) -> str:
@@ -99,8 +124,17 @@ def version_of(name: str) -> str:
 
 
 def show(text: str, stream: TextIO | None = None) -> None:
-    """Print lines on standard output, or on another stream, without characters that steer a terminal."""
-    print("\n".join(map(printable, text.split("\n"))), file=stream or sys.stdout, flush=True)
+    """Print lines on standard output, or on another stream, without characters that steer a terminal.
+
+    Raises:
+        SystemExit: what reads the stream has left, as ``head`` does; with the status of a program that SIGPIPE ends.
+    """
+    stream = stream or sys.stdout
+    try:
+        print("\n".join(map(printable, text.split("\n"))), file=stream, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())  # what is still in its buffer goes there at the end
+        raise SystemExit(128 + signal.SIGPIPE) from None
 
 
 def open_standard_streams() -> None:

@@ -117,6 +117,20 @@ def most_events(
 
 DEFAULT_PRESET = "paper"
 
+_WORLDS: Mapping[str, Any] = {
+    "world_speed_px": (4.0, 400.0),
+    "world_turn_deg": (0.0, 45.0),
+    "world_zoom": (0.0, 0.3),
+    "world_tilt": (0.0, 0.15),
+    "world_shake_px": (0.0, 3.0),
+    "world_patches": 2,
+    "world_patch_px": (32.0, 96.0),
+    "world_still_share": 0.1,
+    "world_turn_only_share": 0.1,
+    "world_plain_share": 0.1,
+}
+"""Photographs that move, for the paper's pixel: from a tripod to a run, up to 7 px from frame to frame at 60 Hz."""
+
 PRESET_FIELDS: Mapping[str, Mapping[str, Any]] = {
     "paper": {},
     # Ablation "-F": one draw of the thresholds per video, the same in every epoch.
@@ -181,19 +195,9 @@ PRESET_FIELDS: Mapping[str, Mapping[str, Any]] = {
         "hot_pixel_share": (0.0, 5e-4),  # a guess, as davis346
         "hot_pixel_sigma": (0.0, 20.0),
     },
-    # Photographs that move, for the paper's pixel: from a tripod to a run, up to 7 px from frame to frame at 60 Hz.
-    "worlds": {
-        "world_speed_px": (4.0, 400.0),
-        "world_turn_deg": (0.0, 45.0),
-        "world_zoom": (0.0, 0.3),
-        "world_tilt": (0.0, 0.15),
-        "world_shake_px": (0.0, 3.0),
-        "world_patches": 2,
-        "world_patch_px": (32.0, 96.0),
-        "world_still_share": 0.1,
-        "world_turn_only_share": 0.1,
-        "world_plain_share": 0.1,
-    },
+    "worlds": _WORLDS,
+    # The same, closer to light (docs/guides/photographs.md).
+    "worlds-fine": {**_WORLDS, "world_bits": 16, "world_change_share": 0.5},
 }
 
 STREAM_PRESETS: Mapping[str, Mapping[str, Any]] = {
@@ -202,14 +206,15 @@ STREAM_PRESETS: Mapping[str, Mapping[str, Any]] = {
     "fast": {"samples_per_decode": 4},
     "natural": {"samples_per_decode": 1, "scene": "auto", "moving_share": 0.75},
     "worlds": {"samples_per_decode": 1, "recipe": "worlds"},
+    "worlds-fine": {"samples_per_decode": 1, "recipe": "worlds-fine"},
     "natural-davis346": {
         "samples_per_decode": 1, "scene": "auto", "moving_share": 0.75, "recipe": "davis346-running",
     },
 }  # fmt: skip
 """Spec fields that each preset sets; a recipe by its name. The first three trade accuracy for speed
 (`docs/accuracy.md`); "natural" is for videos as they are: what spoils events is left out, and most crops show something
-that moves (`docs/scene.md`); "natural-davis346" shows them to a running camera (`docs/effects.md`); "worlds" is for
-photographs.
+that moves (`docs/scene.md`); "natural-davis346" shows them to a running camera (`docs/effects.md`); "worlds" and
+"worlds-fine" are for photographs (`docs/guides/photographs.md`).
 """
 
 
@@ -263,6 +268,12 @@ class Recipe(Persisted):
     lead_frames: int = whole(0, 0, 1, "1 adds the frame before the first target frame (flow networks)")
     lead_voxels: int = whole(0, 0, 1, "1 adds one voxel grid before the first (ERAFT)")
     frame_stride: int = whole(1, 1, 1000, "use every n-th frame, as if the video had 1/n of its frame rate")
+    exposure_seconds: Range = span(
+        (0.0, 0.0), 1e-6, 10.0,
+        "exposure of frames_blurred, around the time of each frame; the events are those of the same light",
+        unit="s", off=True, is_later=True,
+        usual=(1e-5, 0.2), mistake="The picture would be exposed for {0:g} s. Divide milliseconds by 1000.",
+    )  # fmt: skip
     max_boxes: int = whole(
         64, 1, 4096, "most boxes of a frame, if boxes are requested; the smallest ones beyond it are left out",
         is_later=True,
@@ -463,6 +474,13 @@ class Recipe(Persisted):
     world_plain_share: float = number(
         0.0, 0.0, 1.0, "share of scenes whose photograph is out of focus behind sharp patches", is_later=True
     )
+    world_bits: int = whole(12, 12, 16, "bits of a level of the rendered pictures", is_later=True)
+    world_change_share: float = number(
+        0.0, 0.0, 100.0,
+        "most change of light in a sub-step, as a share of the threshold, of 99 % of the pixels that change: steps are "
+        "divided, at most 16 times, by pictures rendered between two frames; 0: off",
+        is_later=True,
+    )  # fmt: skip
     track_points: int = whole(64, 1, 65_536, "N, points that the array tracks follows", is_later=True)
 
     def __post_init__(self) -> None:
@@ -674,11 +692,7 @@ class Recipe(Persisted):
 
     def warn(self, say: Callable[[str], object] = _LOG.warning) -> None:
         """Warn of values that no real camera has, each once in a process."""
-        for name, setting in settings_of(Recipe).items():
-            line = setting.warning(f"warning: recipe {name}", getattr(self, name))
-            if line and line not in _WARNED:
-                _WARNED.add(line)
-                say(line)
+        warn_unusual("recipe ", {name: getattr(self, name) for name in settings_of(Recipe)}, say)
 
     def to_dict(self) -> dict[str, Any]:
         """Return all fields as plain values: ranges as lists, without those of later releases that are at their
@@ -713,6 +727,22 @@ class Recipe(Persisted):
         """
         require_known(changes, settings_of(Recipe), "recipe key", RecipeError)
         return dataclasses.replace(self, **changes)
+
+
+def warn_unusual(side: str, values: Mapping[str, Any], say: Callable[[str], object] = _LOG.warning) -> None:
+    """Warn of checked values that no real camera has, each once in a process.
+
+    Args:
+        side: what the names belong to, for the text.
+        values: of fields of a recipe, by name; ``threshold_pos`` and ``threshold_neg`` are thresholds.
+    """
+    known = settings_of(Recipe)
+    for name, value in values.items():
+        setting = known["threshold" if name in ("threshold_pos", "threshold_neg") else name]
+        line = setting.warning(f"warning: {side}{name}", value)
+        if line and line not in _WARNED:
+            _WARNED.add(line)
+            say(line)
 
 
 @cache

@@ -122,6 +122,7 @@ class ArrayForm:
         shape: dtype and shape for one sample, by the recipe and the spec's ``voxel_dtype``.
         needs: what it is made from.
         empty: value of the whole array in a sample for which it cannot be made.
+        refused: why there is none under a recipe, and what to do; "" if there is.
         of_events: dtype and shape of a representation (``v2v_server/simulation/representations/``), which the kernel
             makes; None for all other arrays.
     """
@@ -130,6 +131,7 @@ class ArrayForm:
     needs: Needs = Needs()
     empty: float = 0
     of_events: EventShape | None = None
+    refused: Callable[[Recipe], str] = lambda _: ""
 
 
 def of_events(shape: EventShape, seconds: Seconds = "", empty: float = 0) -> ArrayForm:
@@ -147,6 +149,11 @@ def of_events(shape: EventShape, seconds: Seconds = "", empty: float = 0) -> Arr
     )
 
 
+_SHARP = "needs an exposure, and the recipe has none: set exposure_seconds, such as 0.01"
+_NO_SHAPE = (
+    "has one shape for all samples, but with voxel_seconds each has another number of frames: ask for frames, or set "
+    "voxel_seconds to 0"
+)
 _REAL = {"float32": "float32"}
 """dtype of values that are no counts, by ``voxel_dtype``; float16 for the others."""
 ARRAYS: dict[str, ArrayForm] = {
@@ -160,7 +167,14 @@ ARRAYS: dict[str, ArrayForm] = {
     "frames_rgb": ArrayForm(
         lambda recipe, _: ("uint8", (recipe.delivered_frames, 3, *recipe.crop_px)), Needs(colour=True)
     ),
-    "frames_all": ArrayForm(lambda recipe, _: ("uint8", (recipe.steps + 1, 1, *recipe.crop_px))),
+    "frames_blurred": ArrayForm(
+        lambda recipe, _: ("uint8", (recipe.delivered_frames, 1, *recipe.crop_px)), Needs(seconds="must"),
+        refused=lambda recipe: "" if any(recipe.exposure_seconds) else _SHARP,
+    ),
+    "frames_all": ArrayForm(
+        lambda recipe, _: ("uint8", (recipe.steps + 1, 1, *recipe.crop_px)),
+        refused=lambda recipe: _NO_SHAPE if recipe.is_timed else "",
+    ),
     "frames_u16": ArrayForm(lambda recipe, _: ("uint16", (recipe.delivered_frames, 1, *recipe.crop_px))),
     "flow": ArrayForm(
         lambda recipe, _: ("float16", (recipe.voxels_per_clip, 2, *recipe.crop_px)), Needs(flow="estimated")
@@ -192,10 +206,10 @@ is that of the voxels, so that ``counts[:, 1] - counts[:, 0]`` does not wrap. vo
 the two bins next to its time (Zhu et al. 2019). time_surface is the age of a pixel's last negative (0) and positive (1)
 event at the end of each bin, seconds; infinity before its first one in the clip.
 
-frames_rgb are the frames in colour; frames_all are all frames that are simulated, the first included. boxes, masks
-and tracks belong to the frames of the same number. masks hold classes; 255 marks a sample without labels. Masks of
-photographs need no sidecar: 0 is the photograph, 1 and 2 the patches in front of it. tracks follow ``track_points``
-points, and only photographs have them."""
+frames_rgb are the frames in colour; frames_blurred are exposed for a time (``exposure_seconds``); frames_all are all
+frames that are simulated, the first included. boxes, masks and tracks belong to the frames of the same number. masks
+hold classes; 255 marks a sample without labels. Masks of photographs need no sidecar: 0 is the photograph, 1 and 2 the
+patches in front of it. tracks follow ``track_points`` points, and only photographs have them."""
 DEFAULT_ARRAYS = ("voxels", "frames")
 Layout: TypeAlias = Mapping[str, tuple[str, tuple[int, ...]]]
 """dtype and shape of each array of one sample, by name, in the order of the headers."""
@@ -247,6 +261,7 @@ class SampleParams(Persisted):
         log_eps: epsilon inside the logarithm where the recipe gives a range; None where it gives one value.
         voxel_seconds: drawn duration of a voxel grid; 0 if the recipe states none.
         grid_steps: steps between frames that each grid of this duration spans; empty if the recipe states none.
+        exposure_seconds: of the frames that are blurred; 0 if the recipe states none.
     """
 
     threshold_pos: float
@@ -265,6 +280,7 @@ class SampleParams(Persisted):
     log_eps: float | None = later(None)
     voxel_seconds: float = later(0.0)
     grid_steps: tuple[int, ...] = later(())
+    exposure_seconds: float = later(0.0)
 
     def __post_init__(self) -> None:
         known = effect_settings()
@@ -321,8 +337,8 @@ class Provenance(Persisted):
         boxes_dropped: boxes that ``max_boxes`` left out, in all frames of the sample.
         grid_seconds: actual duration of each voxel grid, where the recipe states ``voxel_seconds``.
         left_out: effects of the draw that were not simulated; only samples of earlier releases have any.
-        substeps: parts that the clip's steps were divided into along the motion, undivided steps included; 0: the spec
-            states no ``substep_px``, so no motion was used.
+        substeps: parts that the clip's steps were divided into, undivided steps included; 0: the spec divides none
+            (``substep_px``, ``world_change_share``).
         remark: what of the video is not served, or served with wrong grey levels or times; empty for most.
         dropped: as ``boxes_dropped``, for other labels by name; only those that have any.
     """
@@ -369,19 +385,15 @@ def array_layout(recipe: Recipe, voxel_dtype: str, arrays: tuple[str, ...]) -> L
     """Return dtype and shape of each requested array of one sample, as :data:`ARRAYS` states them.
 
     Raises:
-        UsageError: an unknown array, an array requested twice, an empty request, or ``frames_all`` with
-            ``voxel_seconds``.
+        UsageError: an unknown array, one requested twice, an empty request, or one that a recipe does not have.
     """
     if not arrays or len(set(arrays)) != len(arrays):
         raise UsageError(f"arrays = {list(arrays)}: ask for one or more of {', '.join(ARRAYS)}, each once")
-    if recipe.is_timed and "frames_all" in arrays:
-        raise UsageError(
-            "arrays: frames_all has one shape for all samples, but with voxel_seconds each has another number of "
-            "frames: ask for frames, or set voxel_seconds to 0"
-        )
     for name in arrays:
         if name not in ARRAYS:
             raise UsageError(f"arrays: unknown array {name!r}; known: {', '.join(ARRAYS)}")
+        if why := ARRAYS[name].refused(recipe):
+            raise UsageError(f"arrays: {name} {why}")
     return {name: ARRAYS[name].shape(recipe, voxel_dtype) for name in arrays}
 
 

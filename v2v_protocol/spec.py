@@ -155,17 +155,24 @@ class StreamSpec(Persisted):
                 f"spec flow_from = {self.flow_from}: give a whole number from 0 to the recipe's voxels_per_clip "
                 f"= {self.recipe.voxels_per_clip}"
             )
-        most_events = self.recipe.worst_events(1.0, levels_per_step=MOST_SUBSTEPS - 1 if self.substep_px else 0)
+        most_events = self.recipe.worst_events(1.0, levels_per_step=self.levels_per_step)
         if most_events > LARGEST_EVENTS:
+            name = "substep_px" if self.substep_px else "world_change_share"
+            value = self.substep_px or self.recipe.world_change_share
             raise UsageError(
-                f"spec substep_px = {self.substep_px:g}: a pixel may fire {most_events:.4g} events in a clip; the "
-                f"limit is {LARGEST_EVENTS:.4g}: raise the recipe's smallest threshold, or set substep_px to 0"
+                f"spec {name} = {value:g}: a pixel may fire {most_events:.4g} events in a clip; the "
+                f"limit is {LARGEST_EVENTS:.4g}: raise the recipe's smallest threshold, or set {name} to 0"
             )
         if self.samples_per_decode == 1 and self.sibling_spacing:
             raise UsageError(
                 f"spec sibling_spacing = {self.sibling_spacing} applies only to samples_per_decode above 1, which is "
                 "1: set sibling_spacing = 0, or raise samples_per_decode"
             )
+
+    @property
+    def levels_per_step(self) -> int:
+        """Return the largest number of levels between two frames."""
+        return MOST_SUBSTEPS - 1 if self.substep_px or self.recipe.world_change_share else 0
 
     @property
     def kept_defects(self) -> frozenset[str]:

@@ -1,4 +1,4 @@
-"""Read recordings of event cameras, form by form.
+"""Read and write recordings of event cameras, form by form.
 
 items.py         what readers yield: sensor size, chunks of events, pictures, flow
 event_columns.py what the numbers of events mean, for all forms: polarities, coordinates, units, clocks
@@ -11,6 +11,9 @@ bag.py           ROS 1 bags
 faery_reader.py  aedat4, Event Stream, by the package faery
 prophesee.py     EVT 2, EVT 3, DAT
 evt3.py          words of EVT 3 decoded and encoded
+writers.py       a writer for each form, which takes events and pictures piece by piece
+layout.py        the h5 layout of this project's recordings; layout_writer.py writes it from items of any reader
+late_signals.py  Ctrl-C between two writes, not within one
 limits.py        sizes and times that each form can hold
 time_stamps.py   times of pictures in a text, whose unit may be open
 archive.py       a zip file, a folder or a single file, through one interface

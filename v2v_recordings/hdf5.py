@@ -1,7 +1,7 @@
 """Open HDF5 files from untrusted sources, which may refer to other files; read columns of events, and pictures.
 
 Here is also the reader of the layout of event_cnn_minimal and V2V, which ``v2v-convert`` writes
-(``trainer.evaluation.layout``):
+(:mod:`v2v_recordings.layout`):
 
 | path | content |
 |---|---|

@@ -30,10 +30,12 @@ FORM_LIMITS = {
     "Event Stream": Limit((1 << 16) - 1),
     "DSEC's layout": Limit(1 << 16),
     "npz": Limit(1 << 16),
+    "E2VID's layout": Limit(1 << 16, 1 << 52),
+    "EVREAL's layout": Limit(1 << 16, 1 << 52),
 }
 """Coordinates have 11 bits in EVT and 14 in DAT, and are int16 in AEDAT 4 and uint16 in the others. The package faery
-writes the size of the last three forms but two into a field of the same width. Times of DAT have 32 bits; 9.5 hours of
-EVT 3 have 17 MB of words of time."""
+writes the size of DAT, AEDAT 4 and Event Stream into a field of the same width. Times of DAT have 32 bits; 9.5 hours of
+EVT 3 have 17 MB of words of time. Seconds in float64 tell microseconds apart for longer than a century."""
 
 
 def fits(form: str, width_px: int, height_px: int) -> bool:

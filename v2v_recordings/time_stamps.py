@@ -5,7 +5,8 @@ commas and semicolons separate them. A time is a number, or a date such as ``201
 does not matter. A byte order mark, comments from ``#`` on and headings are passed over.
 
 Numbers are seconds, unless a heading or first comment states another unit (``time_us``, ``[ns]``, "in ms"), or seconds
-give a rate that no camera has and another unit gives one. What is assumed so is said.
+give a rate that no camera has and another unit gives one. What is assumed so is said, also of numbers of pictures in
+place of times, which are seconds too.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def read_times(data: bytes) -> tuple[npt.NDArray[np.int64], Sequence[str], str]:
 
     Returns:
         [N] nanoseconds, increasing; the pictures' names as they are written, N, empty where none are stated; what was
-        assumed of the unit, "" where the text states it, and for seconds.
+        assumed of the unit, "" where the text states it, and for seconds that do not count the pictures.
 
     Raises:
         ValueError: a line is something else, or its time does not come after the one before; or the unit is open.
@@ -102,5 +103,11 @@ def _nanoseconds(column: Sequence[str], heading: str) -> tuple[npt.NDArray[np.in
         raise ValueError(f"its times may be in {shown}: state the unit in a first line, such as # time_{units[0]}")
     if not np.all(np.abs(times.astype(float) * _NS[units[0]]) < 2.0**62):
         raise ValueError(f"states a time beyond 4e9 s, if it is in {units[0]}")
+    remark = f"its times are taken for {shown}" if is_open else ""
+    if is_whole and not stated and len(times) > 1 and (np.diff(times) == 1).all():
+        remark = (
+            f"its numbers, {column[0]}, {column[1]} ..., count the pictures one by one and are taken for seconds, 1 "
+            "picture a second: if they are no times, remove the file and state the rate with --rate"
+        )
     ns = times * _NS[units[0]]
-    return ns if is_whole else np.rint(ns).astype(np.int64), f"its times are taken for {shown}" if is_open else ""
+    return ns if is_whole else np.rint(ns).astype(np.int64), remark

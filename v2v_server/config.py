@@ -15,7 +15,8 @@ from v2v_protocol.recipe import STREAM_PRESETS
 from v2v_protocol.settings import bounds, check_settings, number, require_known, settings_of, switch, text, whole, word
 from v2v_protocol.spec import SPEC_KEYS, StreamSpec
 from v2v_protocol.spec_flags import read_recipe, read_yaml_mapping, recipe_setting
-from v2v_server.store.pixels import HIGHEST_RATE_HZ, PIXEL_KINDS
+from v2v_server.kinds.kind import VideosKind
+from v2v_server.kinds.registry import VIDEOS, KindFlags, kind_from
 from v2v_server.system.log import LOG_FORMATS
 from v2v_server.video.rows import Rows
 
@@ -30,7 +31,8 @@ class ServeConfig:
     """Settings of one server. Flags are these names with dashes; keys of a YAML file are these names with either.
 
     Attributes:
-        spec: the default for consumers that request nothing else. Its fields are flags and keys like the others.
+        kind: what a video is. Its fields, and those of ``spec``, are flags and keys like the others.
+        spec: the default for consumers that request nothing else.
 
     Raises:
         UsageError: an unknown key, a value of the wrong kind or outside its limits.
@@ -43,24 +45,6 @@ class ServeConfig:
         group="Videos",
     )
     list: str = text("", "list file (path frames c+ c-) that restricts the videos", metavar="FILE")
-    videos_kind: str = word(
-        "videos",
-        PIXEL_KINDS,
-        "what a video is: videos is a file; sequences is a folder, or a zip archive, of numbered pictures; photographs "
-        "is a picture that the camera moves over",
-    )
-    rate: float = number(
-        0.0, 0.0, HIGHEST_RATE_HZ,
-        "rate of picture sequences without time stamps, 0: unknown; of photographs, 0: 60", unit="Hz", metavar="N",
-    )  # fmt: skip
-    photograph_seconds: float = number(
-        0.0, 0.0, 1e6, "time for which each photograph is shown; 0: 10", unit="s", metavar="S"
-    )
-    picture_bits: int = whole(
-        0, 0, 15,
-        "bits, 8 to 15, that the levels of picture sequences of 16 bits hold, such as 12 for 0 to 4095; 0: all 16",
-        metavar="N",
-    )  # fmt: skip
     rows: str = text("full", "rows of each picture to use: full, top:0.54 (WebVid), top:180px, 0.1:0.6", metavar="ROWS")
     cache_dir: str = text(
         "", "folder of the catalogue index and the quarantine (default: the user's cache folder)", metavar="DIR"
@@ -143,6 +127,7 @@ class ServeConfig:
         "text", LOG_FORMATS, "format of standard error: text for people, or json, one object per line"
     )  # fmt: skip
     parent_pid: int = whole(0, 0, 1 << 31, "stop when this process is no longer the parent; 0: never", is_hidden=True)
+    kind: VideosKind = VIDEOS
     spec: StreamSpec = field(default_factory=StreamSpec)
 
     def __post_init__(self) -> None:
@@ -214,7 +199,8 @@ class ServeConfig:
             named = {**STREAM_PRESETS.get(values.get("preset") or "", {}), **values}
             values["recipe"] = recipe_setting(None, settings, named.get("recipe"))
         fields = {name: values.pop(name) for name in SPEC_KEYS if name in values}
-        config = cls(**values, spec=StreamSpec.from_dict(fields))
+        kind = kind_from({name: values.pop(name) for name in settings_of(KindFlags) if name in values})
+        config = cls(**values, kind=kind, spec=StreamSpec.from_dict(fields))
         for name, (needed, is_given) in _NEEDS.items():
             if (values | fields).get(name) and not is_given(config):
                 raise UsageError(f"{flag_of(name)} has no effect without {needed}; give both, or neither")
@@ -234,12 +220,11 @@ _NEEDS: Mapping[str, tuple[str, Callable[[ServeConfig], object]]] = {
     "scale_seconds": ("--workers LEAST:MOST", lambda it: it.least_workers < it.most_workers),
     "ray_address": ("--engine ray", lambda it: it.engine == "ray"),
     "ray_label": ("--engine ray", lambda it: it.engine == "ray"),
-    "photograph_seconds": ("--videos-kind photographs", lambda it: it.videos_kind == "photographs"),
 }
 """Settings that need another one: its flag, and whether it is given."""
 
 
-SERVE_KEYS = (*settings_of(ServeConfig), *SPEC_KEYS)
+SERVE_KEYS = (*settings_of(ServeConfig), *settings_of(KindFlags), *SPEC_KEYS)
 """Keys of a YAML file for ``v2v-serve --config``."""
 
 

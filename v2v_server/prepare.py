@@ -21,7 +21,7 @@ from base64 import b64encode
 from collections import defaultdict
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -47,14 +47,14 @@ from v2v_server.corpus.sources.prepared import (
 )
 from v2v_server.corpus.sources.source import MANIFEST_NAME
 from v2v_server.corpus.videos import VideoEntry
+from v2v_server.kinds.registry import kind_of
 from v2v_server.store.format import DEFAULT_SIZE, SIZES
-from v2v_server.store.pixels import kind_of, open_pixels
 from v2v_server.store.planes import OPTIONAL, whole_cut
 from v2v_server.store.quota import LEAST_FREE_BYTES
 from v2v_server.store.store_file import StoreFile, write_store
 from v2v_server.store.verified import CHANGES_MEANWHILE, Verified
 from v2v_server.system.compile_cache import compile_cache
-from v2v_server.system.isolate import Died, run_isolated
+from v2v_server.system.isolate import Died, run_lent
 from v2v_server.system.process import locked
 from v2v_server.video.decode import ClipRequest, Cut
 from v2v_server.video.frame_index import FrameIndex
@@ -139,20 +139,21 @@ def prepare(
         CorpusError: source and destination overlap, the destination holds something else or was prepared with other
             settings or from another source, a prepared file cannot be read, another process works there, the source is
             a prepared folder itself, or the disk is too full.
-        UsageError: a number of processes below 0, an unknown size, or photographs.
+        UsageError: a number of processes below 0, an unknown size, or a kind of videos that is not prepared.
     """
     if processes < 0:
         raise UsageError(f"{processes} processes: give 0 or more")
     if size not in SIZES:
         raise UsageError(f"size {size!r}: choose one of {', '.join(SIZES)}")
-    if catalogue.source.kind.is_rendered:
-        raise UsageError("photographs are rendered for each sample, so there is nothing to prepare: serve them")
+    if why := catalogue.kind.unprepared:
+        raise UsageError(why)
     tell = progress or (lambda done, total, made, expected: None)
     total = sum(video.frames for video in catalogue.videos)
     tell(0, total, 0, 0)
     target = Path(destination).resolve()
-    check_destination(target, catalogue.folder, single, catalogue)
-    header = Header(str(catalogue.rows), size, len(catalogue.videos), catalogue.folder.name, catalogue.digest)
+    check_destination(target, catalogue.source.folder, single, catalogue)
+    name = Path(catalogue.source.name).name
+    header = Header(str(catalogue.rows), size, len(catalogue.videos), name, catalogue.digest)
     records: dict[str, PreparedVideo] = {}
     jobs: list[Transcoding] = []
     done, looked_at, not_looked_at = 0, 0, list[Refusal]()
@@ -177,7 +178,7 @@ def prepare(
                         # A file that is written again for one plane keeps its others.
                         kept = file.planes.intersection(OPTIONAL) if file else ()
                         wanted = tuple(dict.fromkeys((*planes, *sorted(kept))))
-                        jobs.append(Transcoding(video, catalogue.path(video.id), size, target, stands, looks, wanted))
+                        jobs.append(Transcoding(video, size, target, stands, looks, wanted))
                     tell(done, total, 0, 0)
             room = _Room(target, catalogue, [job.video for job in jobs])
             with write_manifest(target, header, records.values()) as add:
@@ -255,24 +256,21 @@ def _outcomes(
     catalogue: Catalogue, jobs: Sequence[Transcoding], target: Path, processes: int
 ) -> Iterator[tuple[Transcoding, Made | str]]:
     """Yield the file of each job, or why there is none, in order of completion."""
-    failed: list[tuple[Transcoding, str]] = []
 
-    def begun() -> Iterator[Transcoding]:
-        for job in jobs:
-            try:
-                window, index = _window(job.video, catalogue.rows), catalogue.frame_index(job.video.id).to_bytes()
-            except (UsageError, VideoError) as error:
-                failed.append((job, getattr(error, "reason", str(error))))
-            else:
-                yield replace(job, window=window, index=index)
+    @contextmanager
+    def lend(job: Transcoding) -> Iterator[Transcoding]:
+        window, index = _window(job.video, catalogue.rows), catalogue.frame_index(job.video.id).to_bytes()
+        with catalogue.lend(job.video) as source:
+            yield replace(job, source=source, window=window, index=index)
 
-    for job, result in run_isolated(
-        _attempt, begun(), processes, lambda job: _deadline_seconds(job), writable=(target, *compile_cache())
+    for job, result in run_lent(
+        _attempt, jobs, lend, processes, deadline_seconds=_deadline_seconds, writable=(target, *compile_cache())
     ):
         if isinstance(result, Died):
             result = f"hangs the transcoder: {result.how}" if result.overdue_seconds else f"{_CRASHES} ({result.how})"
+        elif isinstance(result, Exception):
+            result = getattr(result, "reason", str(result))
         yield job, result
-    yield from failed
 
 
 def _window(video: VideoEntry, rows: Rows) -> PixelRect:
@@ -314,12 +312,14 @@ def _text(scene: Scene | None) -> str:
     return "" if scene is None else b64encode(scene.to_bytes()).decode()
 
 
-def check_destination(target: Path, source: Path, single: bool = False, catalogue: Catalogue | None = None) -> None:
+def check_destination(
+    target: Path, source: Path | None, single: bool = False, catalogue: Catalogue | None = None
+) -> None:
     """Check a destination without reading a video of the source.
 
     Args:
         target: the destination, resolved.
-        source: the folder of the source, resolved.
+        source: the folder of the source, resolved; None if it is not on this host.
         single: the source is one video: other files of its folder are never used.
         catalogue: the source, once it is probed: see :func:`refuse_links`.
 
@@ -333,10 +333,10 @@ def check_destination(target: Path, source: Path, single: bool = False, catalogu
             raise CorpusError(f"{target}: {at} is a file; give the name of a folder")
         if not is_writable(at):
             raise CorpusError(f"{target}: {at} is write-protected; choose another destination, or allow writing")
-        below = target != source and target.is_relative_to(source)
-        if source.is_relative_to(target) or (below and not single):
+        below = source is not None and target != source and target.is_relative_to(source)
+        if source is not None and (source.is_relative_to(target) or (below and not single)):
             raise CorpusError(f"{target} and the source {source} overlap; choose a destination outside the source")
-        if catalogue is not None:
+        if source is not None and catalogue is not None:
             refuse_links(catalogue, target)
         check_free_space(at)
         if (target / MANIFEST_NAME).exists():
@@ -495,23 +495,23 @@ class Transcoding(Persisted):
 
     Attributes:
         video: as catalogued.
-        source: its file.
         size: how the file is packed, a key of :data:`v2v_server.store.format.SIZES`.
         root: the folder to write to, resolved.
         stands: whether the target is this already, and only its statistics are wanted.
         scene: whether to compute the scene statistics.
         planes: names of the planes to store beside the luma, of :data:`v2v_server.store.planes.OPTIONAL`.
-        window: the part of its upright pictures to store. Window and index are filled in when the job is due.
+        source: its file, or its copy on this host. Source, window and index are filled in when the job is due.
+        window: the part of its upright pictures to store.
         index: its ``FrameIndex.to_bytes()``.
     """
 
     video: VideoEntry
-    source: Path
     size: str
     root: Path
     stands: bool = False
     scene: bool = False
     planes: tuple[str, ...] = ()
+    source: Path = Path()
     window: PixelRect = (0, 0, 0, 0)
     index: bytes = b""
 
@@ -555,7 +555,7 @@ def transcode(job: Transcoding) -> Made:
     cut, rate = whole_cut(len(index), job.window, job.planes), job.video.frames_per_second
     written = _Hashes(xxhash.xxh3_128)
     with (
-        open_pixels(job.source, kind_of(job.video.id)) as pixels,
+        kind_of(job.video.id).open_pixels(job.source) as pixels,
         write_aside_and_rename(job.target, partial=hidden) as path,
     ):
         source = Verified(pixels, os.fspath(job.source), {})

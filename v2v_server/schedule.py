@@ -4,10 +4,8 @@ A sequence is a run of consecutive frames of one video. The sequences of a video
 start + frames needed <= frames, at most ``max_sequences_per_video`` of them (L = frames per sequence). With
 ``voxel_seconds``, L is the frames of the longest duration that the recipe can draw, at the video's average rate.
 
-With scene "auto", repeats, shots, fades and stretches with nothing to see divide a video into runs. A run is what a
-spec may read in one go: frames of one shot with one set of bars, without the pieces that are skipped. Repeated frames
-do not count. Sequences begin at 0, L, 2L ... of each run. Of those that are still for three quarters, and of the others
-that are quiet for half, shares are kept: which, depends on a hash of the video's number and the first frame.
+With scene "auto", videos are divided into runs, which have sequences of their own
+(:mod:`v2v_server.corpus.scenes.runs`).
 
     candidate 0 of (seed, epoch, place)     the sequence that the epoch's permutation puts at ``place``
     candidate k                             a hash of (seed, epoch, place, k), from a video that no earlier candidate
@@ -30,8 +28,7 @@ batches. Places that do not fill a block at the end of the epoch are dropped; th
 from __future__ import annotations
 
 import hashlib
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import repeat
@@ -41,207 +38,27 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.programs import counted
-from v2v_protocol.recipe import LARGEST_SCALE, MOST_STEPS_PER_GRID, Recipe
-from v2v_protocol.sample import Refusal, RefusalKind
-from v2v_protocol.spec import MARGIN_PX, MOST_SUBSTEPS, StreamSpec
-from v2v_server.corpus.catalogue import Catalogue
-from v2v_server.corpus.scenes.scene import MOST_ANALYSED_FRAMES, NO_BARS, Flag, Pieces, Sides, sides_of
+from v2v_protocol.recipe import MOST_STEPS_PER_GRID
+from v2v_protocol.sample import Refusal
+from v2v_protocol.spec import StreamSpec
+from v2v_server.corpus.scenes.runs import SplitSequences
+from v2v_server.corpus.scenes.scene import Sides
 from v2v_server.corpus.videos import SplitVideos, VideoEntry
 from v2v_server.corpus.videos import Videos as CatalogueVideos
-from v2v_server.simulation.draw import admits, smallest_scale
-from v2v_server.store.pixels import kind_of
+from v2v_server.corpus_words import longest_clip, too_small, why_unsuited
+from v2v_server.kinds.registry import VIDEOS, kind_of
+from v2v_server.lease_memory import most_steps
 from v2v_server.video.rows import Rows
 
-_SKIPPED = {
-    "fades": Flag.FADE,
-    "black": Flag.BLACK,
-    "white": Flag.WHITE,
-    "combed": Flag.COMBED,
-    "cuts": Flag.UNSEEN,  # there are most likely more of them
-}
-_Int64 = npt.NDArray[np.int64]
-MOST_CLIP_BYTES = 2 << 30
-"""Largest size of the decoded frames of one lease without margins, in 8 bits."""
-MOST_LEASE_BYTES = 7 << 30
-"""Largest memory that one lease may take, with all that its spec may ask for; a worker has a GiB more."""
-LARGEST_MEMORY_BYTES = MOST_LEASE_BYTES + (1 << 30)
-"""A worker that needs more ends. After three such ends its sample is refused for its spec."""
-WORKER_BYTES = 2 << 30
-"""Memory that the files in ``deploy`` and the Ray engine give a worker: enough for the 201 frames of the paper, resized
-from 3840 x 2160 (:func:`lease_bytes`).
-"""
-_IDLE_BYTES = 256 << 20
-"""A worker without a lease has 182 MiB; the rest is for what grows with neither frames nor pictures."""
-_DECODER_BYTES = 24
-"""For each pixel of a picture. H.264 of 3840 x 2160 took 13 with 8 bits and 29 with 10."""
 _BLOCK = 256
 """Videos whose sequences are counted again for a look-up. Larger blocks take more time, smaller ones more memory."""
 _Videos = Sequence[VideoEntry]
-_SHOWN = 5
 _ROUNDS = 8
 _LEAST_HALF_BITS = 4
 _MASK64 = (1 << 64) - 1
 _MOST_ATTEMPTS = 16
 MOST_CANDIDATES = 8
 """Candidates of one place. If this many random videos in a row are broken, a person must repair the corpus."""
-
-
-@dataclass(frozen=True, slots=True)
-class Cleaning:
-    """What a spec does about the defects of videos.
-
-    Attributes:
-        skipped: bits of :class:`Flag`: no sequence has such a frame.
-        cuts, duplicates, bars: whether sequences end at cuts, leave repeats out, and do without bars.
-    """
-
-    skipped: int
-    cuts: bool
-    duplicates: bool
-    bars: bool
-
-    @classmethod
-    def of(cls, spec: StreamSpec) -> Cleaning:
-        """Return that of a spec with scene "auto"."""
-        kept = spec.kept_defects
-        skipped = sum(flag for kind, flag in _SKIPPED.items() if kind not in kept)
-        return cls(skipped, "cuts" not in kept, "duplicates" not in kept, "bars" not in kept)
-
-
-class Runs:
-    """The usable pieces of videos, and the runs that they form.
-
-    Attributes:
-        piece_first, piece_run: [U] first frame and run of each usable piece.
-        piece_flags: [U], its flags.
-        ends: [U], usable frames up to the end of each piece, of all videos together.
-        first: [R], the usable frames before each run.
-        frames: [R], usable frames of each run.
-        owners: [R], place of its video.
-        sides: [R, 4], bars.
-    """
-
-    def __init__(self, split: SplitVideos, cleaning: Cleaning) -> None:
-        pieces: Pieces = split.pieces
-        flags, owners, firsts = pieces["flags"], split.owners(), split.firsts()
-        sides = sides_of(pieces) if cleaning.bars else np.zeros((len(pieces), 4), np.uint16)
-        skipped = (flags & cleaning.skipped) != 0
-        repeated = (flags & (Flag.REPEAT if cleaning.duplicates else 0)) != 0
-        begins = skipped | (np.diff(owners, prepend=-1) != 0)
-        begins[1:] |= skipped[:-1] | (sides[1:] != sides[:-1]).any(axis=1)
-        if cleaning.cuts:
-            begins |= (flags & Flag.CUT) != 0
-        usable = ~skipped & ~repeated
-        runs, self.piece_run = np.unique(np.cumsum(begins)[usable], return_inverse=True)
-        lengths = (pieces["end"] - firsts)[usable]
-        self.piece_first, self.piece_flags = firsts[usable], flags[usable]
-        self.ends: _Int64 = np.cumsum(lengths)
-        at = np.searchsorted(self.piece_run, np.arange(len(runs)))  # the first piece of each run
-        self.first: _Int64 = (self.ends - lengths)[at]
-        self.frames: _Int64 = np.diff(np.concatenate((self.first, self.ends[-1:])))
-        self.owners, self.sides = owners[usable][at], sides[usable][at]
-        self._piece_begin = self.ends - lengths
-
-    def frame(self, place: _Int64) -> _Int64:
-        """Return which frames of their videos usable frames are, [n], by their places among all, [n]."""
-        piece = self.ends.searchsorted(place, side="right")
-        frames: _Int64 = self.piece_first[piece] + place - self._piece_begin[piece]
-        return frames
-
-    def flagged(self, flag: int, first: _Int64, count: _Int64) -> _Int64:
-        """Return how many of ``count`` usable frames from each place ``first`` on have a flag, [n] all three."""
-        has = (self.piece_flags & flag) != 0
-        lengths = np.where(has, self.ends - self._piece_begin, 0)
-        before = np.cumsum(lengths) - lengths
-
-        def upto(place: _Int64) -> _Int64:
-            piece = np.minimum(self.ends.searchsorted(place, side="right"), len(self.ends) - 1)
-            found: _Int64 = before[piece] + np.where(has[piece], place + 1 - self._piece_begin[piece], 0)
-            return found
-
-        return upto(first + count - 1) - upto(first - 1)
-
-
-class SplitSequences:
-    """Sequences of divided videos.
-
-    Args:
-        split: these videos.
-        whole: [C], how many sequences each would have if all its frames were one run.
-        strides: [C], frames from the first of a sequence to the first of the next.
-        spec: determines the frames of a sequence and what is done about defects.
-        sizes: [C], a number of each video's picture size.
-        suits: return whether a picture of the size of that number, less these bars, is large enough.
-
-    Attributes:
-        counts: [C], sequences of each video.
-    """
-
-    def __init__(
-        self,
-        split: SplitVideos,
-        whole: _Int64,
-        strides: _Int64,
-        spec: StreamSpec,
-        sizes: npt.NDArray[np.integer],
-        suits: Callable[[int, Sides], bool],
-    ) -> None:
-        self._split, self._whole = split, whole
-        self._strides = strides
-        self._runs = runs = Runs(split, Cleaning.of(spec))
-        each = np.maximum((runs.frames - 1) // strides[runs.owners], 0)
-        each[whole[runs.owners] == 0] = 0
-        barred = np.flatnonzero(runs.sides.any(axis=1))
-        pictures = np.column_stack((sizes[runs.owners[barred]], runs.sides[barred]))
-        kinds, kind = np.unique(pictures, axis=0, return_inverse=True)
-        fits = np.array([suits(size, Sides(*sides)) for size, *sides in kinds.tolist()], bool)
-        each[barred] *= fits[kind.ravel()]
-        number = np.repeat(np.arange(len(each)), each)
-        within = np.arange(len(number)) - np.repeat(np.cumsum(each) - each, each)
-        owners = runs.owners[number]
-        places = runs.first[number] + strides[owners] * within
-        starts = runs.frame(places) if len(places) else places
-        if min(spec.still_share, spec.quiet_share) < 1 and len(places):
-            needed = strides[owners] + 1
-            shares = np.where(2 * runs.flagged(Flag.QUIET, places, needed) >= needed, spec.quiet_share, 1.0)
-            shares[4 * runs.flagged(Flag.STILL, places, needed) >= 3 * needed] = spec.still_share
-            kept = (shares >= 1) | (_hash(split.numbers[owners], starts) < shares)
-            owners, starts = owners[kept], starts[kept]
-        found = np.bincount(owners, minlength=len(split)) if len(owners) else np.zeros(len(split), np.int64)
-        self._begin = np.cumsum(found) - found
-        self._starts = starts
-        self.counts: _Int64 = np.minimum(found, spec.max_sequences_per_video)
-
-    def start(self, video: int, place: int) -> int | None:
-        """Return the first frame of a sequence of a video; None if the video is not divided."""
-        at = self._split.find(video)
-        return None if at is None else int(self._starts[self._begin[at] + place])
-
-    def spoilt(self) -> int:
-        """Return the number of sequences that are not where they would be if all frames were one run."""
-        owners = np.repeat(np.arange(len(self.counts)), self.counts)
-        within = np.arange(len(owners)) - np.repeat(np.cumsum(self.counts) - self.counts, self.counts)
-        starts = self._starts[self._begin[owners] + within] if len(owners) else within
-        strides = self._strides[owners]
-        in_place = (starts % strides == 0) & (starts // strides < self._whole[owners])
-        return int(self._whole.sum() - in_place.sum())
-
-    def too_short(self) -> tuple[npt.NDArray[np.integer], _Int64]:
-        """Return the videos without a sequence because they are divided, [n], and the frames of their longest runs."""
-        longest = np.zeros(len(self._split), np.int64)
-        np.maximum.at(longest, self._runs.owners, self._runs.frames)
-        short = (self._whole > 0) & (self.counts == 0)
-        return self._split.numbers[short], longest[short]
-
-
-def _hash(numbers: npt.NDArray[np.integer], starts: _Int64) -> npt.NDArray[np.float64]:
-    """Return a number from 0 up to 1 for each pair: the mixing function of SplitMix64 (Steele et al. 2014)."""
-    mixed = numbers.astype(np.uint64) << np.uint64(32) ^ starts.astype(np.uint64)
-    mixed += np.uint64(0x9E3779B97F4A7C15)
-    mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return (mixed ^ (mixed >> np.uint64(31))) * 2.0**-64
 
 
 @dataclass(frozen=True, slots=True)
@@ -317,16 +134,18 @@ class SequenceTable:
 
     def __init__(self, videos: _Videos, rows: Rows, spec: StreamSpec, columns: Columns | None = None) -> None:
         self._all, self._rows, self._spec, self._columns = videos, rows, spec, columns or Columns(videos)
-        _check_kind(spec, kind_of(videos[0].id) if len(videos) else "videos")
+        self._kind = kind_of(videos[0].id) if len(videos) else VIDEOS
+        if why := self._kind.refuses(spec):
+            raise UsageError(why)
         if spec.scene != "off" and self._columns.split is None:
             raise UsageError(
                 f'scene = "{spec.scene}" needs statistics of the videos, which this catalogue was opened without: '
                 "start the server with --scene auto"
             )
         shown = [videos[first] for first in self._columns.first_of_size]
-        self._suits = np.array([_too_small(video, rows, spec.recipe) is None for video in shown], bool)
+        self._suits = np.array([too_small(video, rows, spec.recipe) is None for video in shown], bool)
         self._most_steps = np.array(
-            [_most_steps(video, rows, spec) if suits else 0 for video, suits in zip(shown, self._suits, strict=True)],
+            [most_steps(video, rows, spec) if suits else 0 for video, suits in zip(shown, self._suits, strict=True)],
             np.int64,
         )
         counts, _ = self._count(0, len(videos))
@@ -360,9 +179,7 @@ class SequenceTable:
         videos, frames = np.flatnonzero(short), columns.frames[short]
         if cut is not None:
             videos, frames = (np.concatenate(both) for both in zip((videos, frames), cut.too_short(), strict=True))
-        clips = map(
-            _longest_clip, frames.tolist(), np.broadcast_to(steps, short.shape)[videos].tolist(), repeat(recipe)
-        )
+        clips = map(longest_clip, frames.tolist(), np.broadcast_to(steps, short.shape)[videos].tolist(), repeat(recipe))
         return tuple(voxels for voxels in clips if voxels)
 
     def __getitem__(self, rank: int) -> VideoSequence:
@@ -396,6 +213,8 @@ class SequenceTable:
         strides = np.maximum(recipe.sequence_at(rates), 1)
         counts = np.clip((columns.frames[first:end] - 1) // strides, 0, spec.max_sequences_per_video)
         counts *= self._suits[size] & (recipe.reach_at(rates) <= self._most_steps[size] * recipe.frame_stride)
+        if least_hz := self._kind.least_hz(spec):
+            counts *= rates >= least_hz * (1.0 - 1e-6)
         if recipe.is_timed:
             steps = recipe.steps_at(rates)
             counts *= (steps > 0) & (steps <= MOST_STEPS_PER_GRID)
@@ -404,27 +223,13 @@ class SequenceTable:
         split = columns.split.between(first, end)
 
         def suits(size: int, sides: Sides) -> bool:
-            return _too_small(self._all[columns.first_of_size[size]], self._rows, recipe, sides) is None
+            return too_small(self._all[columns.first_of_size[size]], self._rows, recipe, sides) is None
 
         at = split.numbers - first
         of_split = np.broadcast_to(strides, counts.shape)[at]
         sequences = SplitSequences(split, counts[at], of_split, spec, columns.size[split.numbers], suits)
         counts[at] = sequences.counts
         return counts, sequences
-
-
-def _check_kind(spec: StreamSpec, kind: str) -> None:
-    """Check that the spec suits what the videos are.
-
-    Raises:
-        UsageError: it does not.
-    """
-    if spec.recipe.is_world and kind != "photographs":
-        raise UsageError(
-            f"the recipe's world fields are for photographs, these are {kind}: add --videos-kind photographs"
-        )
-    if kind == "photographs" and not spec.recipe.is_world:
-        raise UsageError("photographs stand still under this recipe: set world fields, as --preset worlds does")
 
 
 class Refusals(Sequence[Refusal]):
@@ -454,239 +259,7 @@ class Refusals(Sequence[Refusal]):
         return self._why(int(self._places[at]))
 
     def _why(self, place: int) -> Refusal:
-        video, recipe = self._videos[place], self._spec.recipe
-        if recipe.is_timed and (refusal := _unsuited_rate(video, recipe)) is not None:
-            return refusal
-        if video.frames <= recipe.sequence_at(video.frames_per_second):
-            return _too_short(video, recipe)
-        unsuited_size = _too_small(video, self._rows, recipe) or _too_large(video, self._rows, self._spec)
-        return unsuited_size or _all_cut(video, self._rows, self._spec)
-
-
-def _longest_clip(frames: int, steps: int, recipe: Recipe) -> int:
-    """Return the largest ``voxels_per_clip`` that this number of frames is enough for; 0 if it is not enough for
-    any.
-
-    Args:
-        steps: from one delivered frame to the next.
-    """
-    return max(0, (frames - 1) // (steps * recipe.frame_stride) - recipe.lead_voxels)
-
-
-def _unsuited(video: VideoEntry, reason: str, remedy: str) -> Refusal:
-    return Refusal(video.id, None, reason, RefusalKind.UNSUITED, remedy=remedy)
-
-
-def _too_short(video: VideoEntry, recipe: Recipe) -> Refusal:
-    most = _longest_clip(video.frames, int(recipe.steps_at(video.frames_per_second)), recipe)
-    shorter = "shorter voxel_seconds" if recipe.is_timed else "fewer bins, frames_per_bin"
-    remedy = _shorter(most) if most else f"{shorter} or frame_stride, no lead_voxels"
-    if video.frames < 2:
-        remedy = "none: a voxel grid needs two frames"
-    return _unsuited(video, f"{video.frames} frames, {_needs(video, recipe)}", remedy)
-
-
-def _shorter(most: int) -> str:
-    return f"voxels_per_clip at most {most} (--set voxels_per_clip={most})"
-
-
-def _needs(video: VideoEntry, recipe: Recipe) -> str:
-    needed = f"the recipe needs {recipe.sequence_at(video.frames_per_second) + 1}"
-    return f"{needed} at {video.frames_per_second:g} frames/s" if recipe.is_timed else needed
-
-
-def _unsuited_rate(video: VideoEntry, recipe: Recipe) -> Refusal | None:
-    """Return a refusal if the number of steps in a grid of ``voxel_seconds`` is unknown or too large."""
-    steps = int(recipe.steps_at(video.frames_per_second))
-    if not steps:
-        return _unsuited(video, "its frame rate is unknown, and voxel_seconds needs it", "voxel_seconds 0")
-    if steps <= MOST_STEPS_PER_GRID:
-        return None
-    reason = (
-        f"a voxel grid of {recipe.voxel_seconds[1]:g} s spans {steps} steps at {video.frames_per_second:g} frames/s"
-    )
-    return _unsuited(video, f"{reason}, the limit is {MOST_STEPS_PER_GRID}", "shorter voxel_seconds, or frame_stride")
-
-
-def _all_cut(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal:
-    recipe, runs = spec.recipe, Runs(SplitVideos.of([video.pieces or b""]), Cleaning.of(spec))
-    longest, needed = max(runs.frames.tolist(), default=0), int(recipe.sequence_at(video.frames_per_second)) + 1
-    if longest < needed:
-        most = _longest_clip(longest, int(recipe.steps_at(video.frames_per_second)), recipe)
-        reason = f"at most {longest} frames in a row without a defect, {_needs(video, recipe)}"
-        return _unsuited(video, reason, f"{_shorter(most)}, or scene off" if most else "scene off")
-    for sides in runs.sides[runs.frames >= needed].tolist():
-        if (refusal := _too_small(video, rows, recipe, Sides(*sides))) is not None:
-            return refusal
-    return _unsuited(video, "all its sequences are still or quiet", "still_share 1 and quiet_share 1")
-
-
-def _frame_bytes(video: VideoEntry, rows: Rows, spec: StreamSpec) -> tuple[int, int]:
-    """Return the bytes that each frame of a lease adds: to the decoded frames of all its samples, without margins and
-    in 8 bits; and at most to its worker's memory. Requested arrays do not count: they never change which videos are
-    shown.
-
-    Frames are held whole until they are resized, however small the sample is. With scene "auto" those of all samples
-    are held twice while repeated ones are left out. One sample at a time then has its view and a copy of it, voxels,
-    and the levels between its frames.
-    """
-    recipe, samples = spec.recipe, spec.samples_per_decode
-    window, crop, depth = _sizes_of(video, rows, spec)
-    read = window if recipe.resize_scale != (1.0, 1.0) and kind_of(video.id) != "photographs" else crop
-    held = samples + (1 if spec.scene == "off" else samples)
-    seen = 2 * depth + np.dtype(spec.voxel_dtype).itemsize + _level_bytes(spec)
-    return read * samples, depth * window * held + seen * crop
-
-
-def _level_bytes(spec: StreamSpec) -> int:
-    return 2 * (MOST_SUBSTEPS - 1) if spec.substep_px else 0
-
-
-def _sizes_of(video: VideoEntry, rows: Rows, spec: StreamSpec) -> tuple[int, int, int]:
-    """Return the pixels of each frame that are decoded for a sample, those of its crop, and the bytes of a level."""
-    recipe = spec.recipe
-    top, bottom = rows.bounds(video.height_px)
-    whole, crop = (bottom - top) * video.width_px, recipe.crop_height_px * recipe.crop_width_px
-    if kind_of(video.id) == "photographs":
-        return crop, crop, 2
-    sides = 2 * max(spec.flow_margin_px, MARGIN_PX if spec.substep_px else 0)
-    window = min(whole, (recipe.crop_height_px + sides) * (recipe.crop_width_px + sides))
-    is_whole = recipe.resize_scale != (1.0, 1.0) or spec.flow_margin_px < 0
-    return whole if is_whole else window, crop, 1 if recipe.light == "sdr" else 2
-
-
-def lease_bytes(video: VideoEntry, rows: Rows, spec: StreamSpec, array_bytes: int) -> int:
-    """Return the memory that a worker needs for one lease, its own included, bytes: an upper bound, by measurements.
-
-    Unlike the limit on sequences, it may change from release to release: it decides which worker makes a sample, and
-    never what is in it.
-
-    Args:
-        video, rows, spec: what the lease is for.
-        array_bytes: size of the arrays of one sample. Those of the sample before may still be on their way.
-    """
-    recipe = spec.recipe
-    window, crop, depth = _sizes_of(video, rows, spec)
-    frames = int(recipe.reach_at(video.frames_per_second)) // recipe.frame_stride + 1
-    # Repeated frames are left out of a copy, and a picture is turned upright in one: phones film upright pictures so.
-    is_copied = (spec.scene != "off" and "duplicates" not in spec.kept_defects) or video.height_px > video.width_px
-    views = (recipe.resize_scale != (1.0, 1.0)) + (2 if recipe.contrast_probability else 1)
-    clips = frames * depth * window * spec.samples_per_decode * (1 + is_copied)
-    decoder = _DECODER_BYTES * video.width_px * video.height_px
-    simulation = frames * crop * (depth * views + _level_bytes(spec)) + array_bytes
-    return _IDLE_BYTES + clips + max(decoder, simulation) + array_bytes
-
-
-def _most_steps(video: VideoEntry, rows: Rows, spec: StreamSpec) -> int:
-    """Return the largest number of steps whose frames a lease may hold."""
-    read, taken = _frame_bytes(video, rows, spec)
-    return min(MOST_CLIP_BYTES // read, MOST_LEASE_BYTES // taken) - 1
-
-
-def _too_large(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal | None:
-    steps = int(spec.recipe.reach_at(video.frames_per_second)) // spec.recipe.frame_stride
-    if steps <= _most_steps(video, rows, spec):
-        return None
-    read, taken = (size * (steps + 1) for size in _frame_bytes(video, rows, spec))
-    reason = f"one sample takes up to {taken >> 20} MiB of memory, the limit is {MOST_LEASE_BYTES >> 20} MiB"
-    if read > MOST_CLIP_BYTES:
-        reason = f"one sample takes {read >> 20} MiB of decoded frames, the limit is {MOST_CLIP_BYTES >> 20} MiB"
-    remedy = "fewer voxels_per_clip or samples_per_decode, a smaller flow_margin_px, substep_px 0, or resize_scale 1"
-    return _unsuited(video, reason, remedy)
-
-
-def _too_small(video: VideoEntry, rows: Rows, recipe: Recipe, sides: Sides = NO_BARS) -> Refusal | None:
-    try:
-        top, bottom = rows.bounds(video.height_px)
-    except UsageError as error:
-        return _unsuited(video, str(error), "other rows")
-    height, width = bottom - top - sides.top - sides.bottom, video.width_px - sides.left - sides.right
-    if admits(recipe, height, width):
-        return None
-    bars = " and without its bars" if any(sides) else ""
-    if min(height, width) <= 0:
-        return _unsuited(video, f"nothing is left of the picture after rows {rows}{bars}", "other rows")
-    # Round up; otherwise the picture would be a fraction of a pixel too small.
-    scale = math.ceil(smallest_scale(recipe, height, width) * 1000) / 1000
-    reason = (
-        f"picture {width}x{height} after rows {rows}{bars}, the crop is {recipe.crop_width_px}x{recipe.crop_height_px}"
-    )
-    larger = f"resize_scale up to {scale:g}, or a smaller crop" if scale <= LARGEST_SCALE else "a smaller crop"
-    return _unsuited(video, reason, larger)
-
-
-def corpus_summary(
-    catalogue: Catalogue, spec: StreamSpec, table: SequenceTable, *, list_refused: bool = False
-) -> list[str]:
-    """Return lines that say how many sequences there are, which videos give none, and which setting would admit them.
-
-    Args:
-        catalogue, spec, table: of the server.
-        list_refused: whether to name all of those videos, not only the first few.
-    """
-    span, lines = sequence_span(catalogue, spec.recipe)
-    lines = [
-        f"{counted(len(catalogue.videos), 'video')} in {catalogue.source}, {table.videos} of use: "
-        f"{counted(table.count, 'sequence')} of {span} (at most {spec.max_sequences_per_video} a video), "
-        f"rows {catalogue.rows}",
-        *lines,
-    ]
-    if spec.scene != "off":
-        split = 0 if catalogue.videos.split is None else len(catalogue.videos.split)
-        lines.append(
-            f"scene {spec.scene}: {counted(split, 'video has', 'videos have')} shot boundaries or empty parts; "
-            f"{counted(table.spoilt, 'sequence is', 'sequences are')} left out or moved"
-        )
-        if long := int(np.count_nonzero(catalogue.videos.frames > MOST_ANALYSED_FRAMES)):
-            lines.append(
-                f"{counted(long, 'video is', 'videos are')} longer than the {MOST_ANALYSED_FRAMES} frames that are "
-                "analysed: later frames are served only of videos without defects; split long videos to use all of them"
-            )
-    if refusals := table.refusals:
-        lines.append(f"{counted(len(refusals), 'video gives', 'videos give')} none under the server's own recipe:")
-        lines += _listed(refusals, list_refused)
-        lines += _shorter_clips(table)
-    if catalogue.refusals:
-        lines.append(f"{counted(len(catalogue.refusals), 'file')} cannot be used at all:")
-        lines += _listed(catalogue.refusals, list_refused)
-    return lines
-
-
-def sequence_span(catalogue: Catalogue, recipe: Recipe) -> tuple[str, list[str]]:
-    """Return what a sequence consists of, and a warning if frames are too far apart for the recipe's grids."""
-    if not recipe.is_timed:
-        return f"{recipe.frames_needed} frames", []
-    rates = catalogue.videos.frames_per_second
-    steps = recipe.frame_stride / rates[rates > 0.0]  # of videos without a rate there are no sequences
-    if not len(steps):
-        return f"{recipe.spans} grids", []
-    # A grid has the number of steps that comes nearest to its duration, and at least one.
-    made = [np.maximum(np.rint(wanted / steps), 1.0) * steps for wanted in recipe.voxel_seconds]
-    shortest, longest = f"{made[0].min():.3g}", f"{made[1].max():.3g}"
-    span = f"{recipe.spans} grids of {shortest if shortest == longest else f'{shortest} to {longest}'} s"
-    coarse = np.count_nonzero(steps > recipe.voxel_seconds[1])
-    warning = (
-        f"warning: voxel_seconds = {recipe.voxel_seconds[1]:g} is shorter than the time between frames of {coarse} "
-        f"videos (at most {steps.max():.3g} s), so each of their grids lasts from frame to frame: raise voxel_seconds, "
-        "or serve videos with more frames a second"
-    )
-    return span, [warning] if coarse else []
-
-
-def _listed(refused: Sequence[Refusal], all_of_them: bool) -> list[str]:
-    shown = refused if all_of_them else refused[:_SHOWN]
-    rest = len(refused) - len(shown)
-    return [f"  {line}" for line in shown] + ([f"  ... and {rest} more: --list-refused names all"] if rest else [])
-
-
-def _shorter_clips(table: SequenceTable) -> list[str]:
-    """Say how many of the videos that are too short a shorter clip would admit: half of them, and all."""
-    longest = sorted(table.longest_clips, reverse=True)
-    if not longest:
-        return []
-    choices = dict.fromkeys((longest[(len(longest) - 1) // 2], longest[-1]))
-    each = (f"--set voxels_per_clip={n} admits {sum(voxels >= n for voxels in longest)} of them" for n in choices)
-    return [f"  The longest clip that fits has {longest[0]} voxel grids. Shorter clips: {', '.join(each)}"]
+        return why_unsuited(self._videos[place], self._rows, self._spec)
 
 
 class Permutation:

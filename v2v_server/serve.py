@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from v2v_protocol.arena import give_back_freed_memory
-from v2v_protocol.errors import CorpusError, VideoChanged, VideoError, VideoGone
+from v2v_protocol.errors import CorpusError, IndexUnreadable, V2VError, VideoChanged, VideoError, VideoGone
 from v2v_protocol.link.router import ConsumerGone, FromConsumer, FromWorker, InFlight, Sockets
 from v2v_protocol.link.user import OwnUser
 from v2v_protocol.progress import Progress
@@ -29,9 +29,11 @@ from v2v_server.broker.leases import REST_SECONDS, Cause, Loss, Request, clean_n
 from v2v_server.broker.state import (
     Action,
     AddToQuarantine,
+    Broker,
     CheckVideo,
     Disconnect,
     GiveUp,
+    Grant,
     ReportRefusal,
     SendStatus,
     ToConsumer,
@@ -40,14 +42,14 @@ from v2v_server.broker.state import (
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogue
 from v2v_server.corpus.scenes.picture_check import check_in_background
+from v2v_server.corpus_words import corpus_summary, notes_of
 from v2v_server.keys import KeyFolder
 from v2v_server.page.child import PageProcess
 from v2v_server.quarantine import QuarantineEntry, quarantine_path, read_quarantine, write_entry
-from v2v_server.schedule import SequenceTable, corpus_summary
+from v2v_server.schedule import SequenceTable
 from v2v_server.status.snapshot import StatusPublisher
 from v2v_server.status.terminal import StatusView, format_shutdown_summary
 from v2v_server.store.cache import make_cache
-from v2v_server.store.pixels import VideosKind
 from v2v_server.supervise.local_host import WorkerProcess
 from v2v_server.supervise.pool import Pool, Scaling, make_pool, question_workers
 from v2v_server.system.log import GIB, Level, Log
@@ -88,7 +90,7 @@ def load_catalogue(config: ServeConfig) -> Catalogue:
             cache_dir=config.cache_dir or None,
             copies=config.copies or None,
             copies_gib=config.copies_gib,
-            kind=VideosKind(config.videos_kind, config.rate, config.photograph_seconds, config.picture_bits),
+            kind=config.kind,
             scene=config.spec.scene != "off",
             # Without local workers all cores are free for probing.
             processes=min(config.most_workers or cores, cores),
@@ -142,7 +144,7 @@ def serve(config: ServeConfig, standbys: list[WorkerProcess] | None = None, debu
         catalogue = load_catalogue(config)
         table = SequenceTable(catalogue.videos, catalogue.rows, config.spec)
         summary = corpus_summary(catalogue, config.spec, table, list_refused=config.list_refused)
-        for line in (*catalogue.notes, *summary):
+        for line in (*notes_of(catalogue), *summary):
             log.say(line)
         config.spec.recipe.warn(log.say)
         catalogue.fail_fast()
@@ -152,10 +154,9 @@ def serve(config: ServeConfig, standbys: list[WorkerProcess] | None = None, debu
         quarantine = read_quarantine(quarantine_file)
         for entry in quarantine.entries(quarantine.latest):
             log.say(f"in quarantine: {entry}")
-        dispatcher = Dispatcher(
+        broker = Broker(
             catalogue.facts,
             config.spec,
-            complete=lambda lease, spec: complete_lease(lease, catalogue, spec),
             quarantine=quarantine,
             wall_clock=utc_now,
             lease_deadline_seconds=config.lease_deadline_seconds,
@@ -168,14 +169,14 @@ def serve(config: ServeConfig, standbys: list[WorkerProcess] | None = None, debu
         if config.cache:
             worker_flags += ["--cache", str(Path(config.cache).absolute()), "--cache-gib", str(config.cache_gib)]
         worker_flags += ["--debug"] * debug + ["--insecure"] * config.insecure
-        copies, gib = catalogue.source.copies_options
-        worker_flags += ["--copies", str(copies), "--copies-gib", str(gib)] if copies else []
+        if copies := catalogue.source.copies:
+            worker_flags += ["--copies", str(copies.folder), "--copies-gib", str(copies.most_bytes / GIB)]
         stop = threading.Event()
-        sockets.has_session = dispatcher.has_session
+        sockets.has_session = broker.has_session
         signals = opened.enter_context(stop_on_signals(stop))
         pool = make_pool(config, catalogue.source, label, worker_flags, keys, standbys)
         opened.callback(catalogue.close)
-        server = Server(config, catalogue, dispatcher, sockets, pool, quarantine_file, page=page, log=log)
+        server = Server(config, catalogue, Dispatcher(broker), sockets, pool, quarantine_file, page=page, log=log)
         opened.callback(server.close)
         if pool.is_local and (question := question_workers(config.most_workers, usable_cores())):
             log.say(question, "warning")
@@ -220,6 +221,7 @@ class Server:
         self._config = config
         self._catalogue = catalogue
         self._dispatcher = dispatcher
+        self._broker = dispatcher.broker
         self._sockets = sockets
         self._pool = pool
         self._clock = clock or Clock()
@@ -230,7 +232,7 @@ class Server:
         is_fixed = config.least_workers == config.most_workers
         self._scaling = None if is_fixed else Scaling(*config.workers, config.scale_seconds)
         self._view = StatusView(self._log, sys.stderr)
-        self._publisher = StatusPublisher(config, catalogue, dispatcher, pool, sockets, self._clock(), utc_now)
+        self._publisher = StatusPublisher(config, catalogue, self._broker, pool, sockets, self._clock(), utc_now)
         self._announced = False
         self._port_file: Path | None = None
         self._blocked_due: float | None = None
@@ -262,7 +264,7 @@ class Server:
                 self._dispatcher.worker_stalled(self._route(name), stalled)
             self._carry_out(self._retry())
             self._carry_out(self._dispatcher.tick(now))
-            for death in self._pool.watch(now, self._dispatcher.counters.samples):
+            for death in self._pool.watch(now, self._broker.counters.samples):
                 self._say(
                     f"worker {death.identity.decode()} {death.loss.text}; its leases go to other workers", "warning"
                 )
@@ -308,7 +310,16 @@ class Server:
                         self._pool.lend(self._name(identity), arena)
                     is_sent = self._sockets.send(identity, frames, to_worker=True)
                     if not is_sent and not self._pool.watches(self._name(identity)):
-                        todo.extend(dispatcher.worker_unreachable(identity, now()))
+                        todo.extend(dispatcher.worker_gone(identity, now()))
+                case Grant() as grant:
+                    try:
+                        todo.extend(grant.messages(complete_lease(grant.leases[0], self._catalogue, grant.spec)))
+                    except IndexUnreadable as error:  # none of the others can be completed either
+                        grants = [grant, *(each for each in todo if isinstance(each, Grant))]
+                        todo = deque(each for each in todo if not isinstance(each, Grant))
+                        todo.extend(dispatcher.not_granted(grants, error, now()))
+                    except V2VError as error:
+                        todo.extend(dispatcher.not_granted([grant], error, now()))
                 case Disconnect(identity):
                     self._sockets.cut(identity)
                 case GiveUp() as hopeless:
@@ -339,16 +350,13 @@ class Server:
         """
         entry, now = record.entry, self._clock()
         until = now + _RECORD_SECONDS if until is None else until
-        latest = self._dispatcher.quarantine.latest
-        if (
-            self._dispatcher.quarantine.refusal(latest, entry.path, entry.fingerprint, entry.frame, entry.spec)
-            is not None
-        ):
+        latest = self._broker.quarantine.latest
+        if self._broker.quarantine.refusal(latest, entry.path, entry.fingerprint, entry.frame, entry.spec) is not None:
             # Another worker ended over it while the file was locked. A second entry would refuse the whole video.
             return self._dispatcher.quarantine_recorded(record, [], now)
         written: list[QuarantineEntry] = []
         try:
-            written = write_entry(self._quarantine_file, entry, self._dispatcher.quarantine, wait_seconds=0.0)
+            written = write_entry(self._quarantine_file, entry, self._broker.quarantine, wait_seconds=0.0)
         except (OSError, CorpusError) as error:
             if isinstance(error, BlockingIOError) and now < until:
                 self._unrecorded.append((record, until))
@@ -386,7 +394,7 @@ class Server:
         now = self._clock()
         if now >= self._unreadable_said + REST_SECONDS:
             self._unreadable_said = now
-            name = clean_name(self._dispatcher.registry.name_of(missing.identity))
+            name = clean_name(self._broker.registry.name_of(missing.identity))
             is_local = self._catalogue.source.is_local
             file = f"the sidecar {missing.sidecar} of {missing.video}" if missing.sidecar else missing.video
             self._say(
@@ -410,27 +418,27 @@ class Server:
 
     def _name(self, identity: bytes) -> bytes:
         """Return the name by which the pool knows a worker; empty if it has not said hello."""
-        return self._dispatcher.registry.name_of(identity).encode()
+        return self._broker.registry.name_of(identity).encode()
 
     def _route(self, name: bytes) -> bytes:
         """Return the routing id of a worker of the pool; empty if it has not said hello."""
-        return self._dispatcher.registry.named(name.decode()) or b""
+        return self._broker.registry.named(name.decode()) or b""
 
     def _warn_if_blocked(self, now: float) -> None:
         """Warn once if leases stay blocked. Another server that writes blocks the index only briefly."""
-        if not self._dispatcher.blocked_reason:
+        if not self._broker.blocked_reason:
             self._blocked_due = None
         elif self._blocked_due is None:
             self._blocked_due = now + _SOON_SECONDS
         elif now >= self._blocked_due:
             self._blocked_due = math.inf
-            self._say(f"no samples are started: {self._dispatcher.blocked_reason}", "warning")
+            self._say(f"no samples are started: {self._broker.blocked_reason}", "warning")
 
     def _scale(self, now: float) -> None:
         """Change the number of workers if it is not fixed and the load requires it."""
         if self._scaling is None:
             return
-        seen = self._dispatcher
+        seen = self._broker
         decision = self._scaling.decide(now, seen.waiting_share, seen.idle_share, seen.workers)
         if decision is not None:
             self._pool.scale(decision.workers)
@@ -438,7 +446,7 @@ class Server:
 
     def _show(self, now: float) -> None:
         """Announce once that the server is ready; then update the status."""
-        if not self._announced and (self._dispatcher.workers or not self._config.least_workers):
+        if not self._announced and (self._broker.workers or not self._config.least_workers):
             self._announced = True
             address, worker_address = self._sockets.address, self._sockets.worker_address
             # Workers on other hosts cannot use a private address.
@@ -459,7 +467,7 @@ class Server:
             sample: the request that the line is about.
             about: additional fields for programs.
         """
-        identity = None if sample is None or not self._log.is_json else self._dispatcher.identity_of(sample)
+        identity = None if sample is None or not self._log.is_json else self._broker.identity_of(sample)
         if identity is not None:
             about["sample"] = asdict(identity)
         self._log.say(text, level, **about)

@@ -1,8 +1,9 @@
 """What a person runs at a desk, without a server: the same samples, looked at, measured and compared.
 
 simulate        `v2v-simulate`: one sample as a file
+sample_set      `v2v-simulate --count`: samples as recordings
+sample_flags    flags that name samples
 remake          any sample of any stream, made in this process
-event_files     events as HDF5, npz, EVT 3, AEDAT 4
 preview         `v2v-preview`: what a recipe makes of videos, as pictures
 motion          pictures without noise, and seeds whose cameras see motion
 doctor          `v2v-doctor`: what is in the way on this machine, and in a corpus

@@ -14,11 +14,9 @@ from v2v_protocol.errors import VideoError
 from v2v_protocol.recipe import Recipe, effect_settings
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
-from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.picture_check import CHANGES, Defect, hides_motion
 from v2v_server.motion.measure import MeasuredMotion, measure
-from v2v_server.schedule import VideoSequence
 from v2v_server.simulation.effects import NOISE
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.view import apply_view, without_margin
@@ -26,8 +24,12 @@ from v2v_server.store.pixels import signal_of
 from v2v_server.system.compile_cache import cv2
 from v2v_server.video.decode import ClipRequest, Cut, DecodedClip
 from v2v_server.video.picture import SDR
-from v2v_server.worker.produce import Decoded, make_sample, plan_sample
-from v2v_tools.remake import RemadeSample, Remaker, lease_for
+from v2v_server.video.rows import Rows
+from v2v_server.worker.job import ClipJob, SampleJob
+from v2v_server.worker.making.make import make_sample
+from v2v_server.worker.making.plan import plan_sample
+from v2v_server.worker.making.read import Decoded
+from v2v_tools.remake import RemadeSample, Remaker
 
 LONGEST_SIDE_PX = 384
 """The whole picture is simulated at this size: a clip of 201 frames of 1920 x 1080 would take 400 MiB."""
@@ -58,18 +60,18 @@ def quiet_voxels(made: RemadeSample, start: str = "") -> npt.NDArray[Any]:
     Returns:
         [lead voxels + T, bins, H, W], signed event counts.
     """
-    plan, lease = made.decoded.plan, made.lease
-    recipe = noise_free(plan.spec.recipe.replace(start=start or plan.spec.recipe.start))
-    spec = StreamSpec.from_dict({**plan.spec.to_dict(), "recipe": recipe})
-    lease = replace(lease, spec=spec.canonical(), spec_digest=spec.digest, arrays=("voxels",))
+    plan, clip = made.decoded.plan, made.job.clip
+    recipe = noise_free(clip.spec.recipe.replace(start=start or clip.spec.recipe.start))
+    spec = StreamSpec.from_dict({**clip.spec.to_dict(), "recipe": recipe})
+    job = replace(made.job, clip=replace(clip, spec=spec, arrays=("voxels",)))
     params = replace(
         plan.params,
         noise_sigma=0.0,
         hot_pixel_count=0,
         effects={name: value for name, value in plan.params.effects.items() if name not in _NOISE},
     )
-    quiet = Decoded(replace(plan, spec=spec, params=params, flow=None), made.decoded.clip)
-    return make_sample(lease, quiet).arrays["voxels"]
+    quiet = Decoded(replace(plan, params=params, flow=None), made.decoded.clip)
+    return make_sample(job, quiet).arrays["voxels"]
 
 
 def start_events(made: RemadeSample) -> npt.NDArray[np.float64]:
@@ -87,7 +89,7 @@ def measured_motion(made: RemadeSample) -> MeasuredMotion:
     """Measure what moves in the frames of a sample; nothing where they are rendered."""
     if made.decoded.clip.is_view:
         return MeasuredMotion()
-    plan, recipe = made.decoded.plan, made.decoded.plan.spec.recipe
+    plan, recipe = made.decoded.plan, made.job.clip.spec.recipe
     frames = eight_bits(made.decoded.clip.frames, made.decoded.clip.signal)
     return measure(apply_view(without_margin(frames, plan.params, recipe, plan.margin_px), plan.params, recipe))
 
@@ -111,7 +113,7 @@ def describe_motion(found: MeasuredMotion, defects: Sequence[Defect] = ()) -> tu
     )
     if lost > MOST_LOST:
         return text, "something small or fast moves, or flickers, or is noise: sub-steps do not help"
-    return text, f"{JUDGE} tells the error without and with sub-steps" if fast > 1.0 else ""
+    return text, f"{JUDGE} tells the error without and with sub-steps, at twice this motion" if fast > 1.0 else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,94 +142,92 @@ class CropEstimate:
         return self.clip == other.clip and abs(left - x) < width and abs(top - y) < height
 
 
+def step_seconds(clip: ClipJob) -> float:
+    """Return the time between two frames that the pixels see; 0 where it is not known."""
+    return clip.spec.recipe.frame_stride / clip.frames_per_second if clip.frames_per_second else 0.0
+
+
 class WholePictures:
     """Simulates whole pictures, each once: one threshold, no noise, no pauses.
 
     Args:
-        catalogue: the corpus.
-        stream: whose clips they show; their crops and draws are not used.
+        catalogue: the corpus of the clips.
     """
 
-    def __init__(self, catalogue: Catalogue, stream: StreamSpec) -> None:
-        self._catalogue, self._stream = catalogue, stream
+    def __init__(self, catalogue: Catalogue) -> None:
+        self._catalogue = catalogue
         self._made: dict[tuple[str, int], Camera] = {}
 
-    def camera(self, sequence: VideoSequence) -> Camera:
-        """Return the whole picture of a sequence as a camera sees it that has no noise.
+    def camera(self, job: SampleJob) -> Camera:
+        """Return the whole picture of a job's clip as a camera sees it that has no noise.
 
         Raises:
             VideoError: the video cannot be read, or not simulated.
         """
-        key = sequence.video.id, sequence.start_frame
+        key = job.clip.video, job.clip.start_frame
         if key not in self._made:
-            self._made[key] = self._simulated(sequence)
+            self._made[key] = self._simulated(job)
         return self._made[key]
 
-    def _simulated(self, sequence: VideoSequence) -> Camera:
-        catalogue, video = self._catalogue, sequence.video
-        top, bottom = catalogue.rows.bounds(video.height_px)
-        scale = min(1.0, LONGEST_SIDE_PX / max(bottom - top, video.width_px))
-        height, width = (max(1, round(side * scale)) for side in (bottom - top, video.width_px))
-        recipe = self._stream.recipe
+    def _simulated(self, job: SampleJob) -> Camera:
+        catalogue, clip = self._catalogue, job.clip
+        top, bottom = clip.rows.bounds(clip.height_px)
+        scale = min(1.0, LONGEST_SIDE_PX / max(bottom - top, clip.width_px))
+        height, width = (max(1, round(side * scale)) for side in (bottom - top, clip.width_px))
+        recipe = clip.spec.recipe
         recipe = noise_free(recipe).replace(
             crop_height_px=height, crop_width_px=width, resize_scale=(1.0, 1.0), flip_probability=0.0,
             pause_probability=0.0, contrast_probability=0.0, threshold=(THRESHOLD, THRESHOLD),
             threshold_ratio=(1.0, 1.0), threshold_source="sample", lead_frames=0, lead_voxels=0,
             voxel_seconds=recipe.voxel_seconds[1], **dict.fromkeys(effect_settings(), (0.0, 0.0)),
         )  # fmt: skip
-        spec = StreamSpec.from_dict({"recipe": recipe})
-        lease = lease_for(
-            Request(b"", 0, 0), sequence=sequence, catalogue=catalogue, spec=spec, seed=0, arrays=("voxels", "frames")
-        )
-        lease = replace(lease, rows="full", height_px=height, width_px=width, thresholds=())
-        plan = plan_sample(lease, 0)
+        index, stride = catalogue.frame_index(clip.video), recipe.frame_stride
+        whole = replace(
+            clip, spec=StreamSpec(recipe=recipe), seed=0, arrays=("voxels", "frames"), rows=Rows(), height_px=height,
+            width_px=width, thresholds=None, index_bytes=index.to_bytes(),
+        )  # fmt: skip
+        plan = plan_sample(whole, 0)
         frames = np.empty((len(plan.source), height, width), np.uint8)
-        index, stride = catalogue.frame_index(video.id), recipe.frame_stride
         count = (len(frames) - 1) * stride + 1
-        cut = Cut(len(frames), (top, 0, bottom - top, video.width_px))
-        with catalogue.source.open_pixels(video.id, video.fingerprint) as pixels:
+        cut = Cut(len(frames), (top, 0, bottom - top, clip.width_px))
+        with catalogue.source.open_pixels(clip.video, clip.fingerprint) as pixels:
             signal = SDR if recipe.light == "sdr" else signal_of(pixels, index)._replace(bits=8)
-            taken = pixels.pictures(ClipRequest(index, sequence.start_frame, (cut,), stride))
+            taken = pixels.pictures(ClipRequest(index, clip.start_frame, (cut,), stride))
             for frame, picture in zip(frames, taken, strict=True):
                 cv2.resize(picture.grey, (width, height), frame, interpolation=cv2.INTER_AREA)
-        seconds = index.seconds(sequence.start_frame, count)[::stride]
-        clip = DecodedClip(frames, seconds, codec="", bit_exact=False, signal=signal)
-        sample = make_sample(lease, Decoded(plan, clip))
+        seconds = index.seconds(clip.start_frame, count)[::stride]
+        decoded = DecodedClip(frames, seconds, codec="", bit_exact=False, signal=signal)
+        sample = make_sample(replace(job, clip=whole), Decoded(plan, decoded))
         camera = Camera.of(sample.arrays, sample.provenance, f"threshold {THRESHOLD:g}, no noise", recipe)
-        return replace(camera, step_seconds=stride / video.frames_per_second)
+        return replace(camera, step_seconds=step_seconds(clip))
 
-    def estimate(self, sequence: VideoSequence, seed: int) -> CropEstimate:
-        """Estimate what the camera of a seed sees of a sequence.
+    def estimate(self, job: SampleJob) -> CropEstimate:
+        """Estimate what the camera of a job sees of its clip.
 
         Raises:
             VideoError: see :meth:`camera`.
         """
-        recipe, video = self._stream.recipe, sequence.video
-        lease = lease_for(
-            Request(b"", 0, 0), sequence=sequence, catalogue=self._catalogue, spec=self._stream, seed=seed,
-            arrays=("voxels",),
-        )  # fmt: skip
-        plan = plan_sample(replace(lease, thresholds=()), 0)
+        clip, recipe = job.clip, job.clip.spec.recipe
+        plan = plan_sample(replace(clip, thresholds=None), job.index)
         params = plan.params
         left, top = params.crop_left_px / params.scale, params.crop_top_px / params.scale
         width, height = recipe.crop_width_px / params.scale, recipe.crop_height_px / params.scale
-        whole = self.camera(sequence)
+        whole = self.camera(job)
         bins = whole.voxels.reshape(-1, *whole.voxels.shape[2:])
         steps = sum(params.grid_steps[recipe.lead_voxels :]) or recipe.voxels_per_clip * recipe.steps_per_frame
         shown = whole.provenance.params.ends(recipe)[-1] if recipe.is_timed else steps
         seen = int(plan.source[-1]) * len(bins) // int(shown)  # pauses leave the rest out
-        scale = bins.shape[-1] / video.width_px
+        scale = bins.shape[-1] / clip.width_px
         rows, columns = (
             slice(int(at * scale), int((at + size) * scale)) for at, size in ((top, height), (left, width))
         )
         crop = bins[:, rows, columns]
         events = float(np.abs(crop[:seen], dtype=np.float32).sum()) / (crop[0].size * steps)
-        seconds = recipe.frame_stride / video.frames_per_second if video.frames_per_second > 0 else 0.0
         return CropEstimate(
-            (video.id, sequence.start_frame),
+            (clip.video, clip.start_frame),
             (left, top, width, height),
             events * THRESHOLD / max(params.threshold_pos, params.threshold_neg),
-            noise_rate(params, seconds),
+            noise_rate(params, step_seconds(clip)),
         )
 
 
@@ -238,7 +238,7 @@ def moving_seeds(remaker: Remaker, wholes: WholePictures, count: int) -> tuple[l
 
     Args:
         remaker: of the stream that the cameras are drawn from.
-        wholes: of the same stream.
+        wholes: of the same corpus.
         count: seeds wanted.
 
     Returns:
@@ -248,12 +248,12 @@ def moving_seeds(remaker: Remaker, wholes: WholePictures, count: int) -> tuple[l
     views: dict[int, CropEstimate] = {}
     clips: dict[tuple[str, int], bool] = {}
     for seed in range(max(CANDIDATES, 2 * count)):
-        sequence = remaker.sequence(seed, 0, 0)
-        clip = sequence.video.id, sequence.start_frame
+        job = remaker.job(seed, 0, 0)
+        clip = job.clip.video, job.clip.start_frame
         if not clips.get(clip, len(clips) < _MOST_CLIPS):
             continue
         try:
-            views[seed] = wholes.estimate(sequence, seed)
+            views[seed] = wholes.estimate(job)
         except VideoError:
             clips[clip] = False
         else:

@@ -34,13 +34,17 @@ from v2v_protocol.write_aside import check_output, write_file
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.picture_check import defects_of_video
+from v2v_server.corpus_words import notes_of
+from v2v_server.kinds.kind import VideosKind
+from v2v_server.kinds.registry import VIDEOS, KindFlags, kind_from
 from v2v_server.motion.measure import MeasuredMotion, together
-from v2v_server.schedule import SequenceTable, VideoSequence
+from v2v_server.schedule import SequenceTable
 from v2v_server.simulation.intensity import tone_table
-from v2v_server.store.pixels import VIDEOS, VideosKind, signal_of
+from v2v_server.store.pixels import signal_of
 from v2v_server.video.decode import ClipRequest, Cut
 from v2v_server.video.picture import SDR
 from v2v_server.video.probe import DOLBY_VISION
+from v2v_server.worker.job import SampleJob
 from v2v_tools.motion import (
     WholePictures,
     describe_motion,
@@ -49,8 +53,9 @@ from v2v_tools.motion import (
     moving_seeds,
     quiet_voxels,
     start_events,
+    step_seconds,
 )
-from v2v_tools.remake import Remaker, open_shown
+from v2v_tools.remake import RemadeSample, Remaker, open_shown
 
 LABELS = ("boxes", "masks")
 """Arrays that are drawn if the videos have their sidecars."""
@@ -115,25 +120,25 @@ def preview(
     scene = StreamSpec.from_dict({**spec, "recipe": wanted[0].recipe}).scene != "off"
     catalogue = open_shown(source, list_file=list_file, rows=rows, scene=scene, cache_dir=cache_dir, kind=kind)
     cameras: list[Camera] = []
-    moving, started, notes = list[MeasuredMotion](), np.zeros(2), dict[str, list[str]]()
-    for note in catalogue.notes:
+    jobs, moving, started, notes = list[SampleJob](), list[MeasuredMotion](), np.zeros(2), dict[str, list[str]]()
+    for note in notes_of(catalogue):
         say(note)
     try:
         first = _fitted_stream(catalogue, spec, wanted[0].recipe)
-        wholes = WholePictures(catalogue, first)
-        if find_motion and not kind.is_rendered:
+        wholes = WholePictures(catalogue)
+        if find_motion and kind.has_motion:
             wanted, note = _moving(wanted, Remaker(catalogue, first), wholes)
             say(note)
         with Progress("simulating", "cameras") as progress:
             for each in wanted:
-                camera, motion, events = _camera(catalogue, each, spec, with_flow, notes)
+                camera, made = _camera(catalogue, each, spec, with_flow, notes)
                 cameras.append(camera)
-                moving.append(motion)
-                started = started + events
+                jobs.append(made.job)
+                moving.append(measured_motion(made))
+                started = started + start_events(made)
                 progress(len(cameras), len(wanted))  # the first may include compiling; the estimate begins after it
-        # A photograph stands still, apart from what each camera sees of it.
-        whole = None if kind.is_rendered else wholes.camera(_sequence_of(catalogue, cameras[0].provenance))
-        looks = first.scene == "off" and not kind.is_rendered
+        whole = wholes.camera(jobs[0]) if kind.has_motion else None
+        looks = first.scene == "off" and kind.has_scenes
         shown = sorted({camera.provenance.video for camera in cameras}) if looks else ()
         defects = [each for id in shown for each in defects_of_video(catalogue, id)]
     finally:
@@ -142,7 +147,7 @@ def preview(
     for note, titles in notes.items():
         say(f"{', '.join(titles) if len(titles) < len(wanted) else 'all cameras'}: {note}")
     say(f"{describe_start(started)} (recipe field start)")
-    if not kind.is_rendered:
+    if kind.has_motion:
         say(f"motion: {'; '.join(filter(None, describe_motion(together(moving), defects)))}")
     write_file(out, _content(out.suffix.lower(), whole, cameras, title, moments))
     say(f"{out}: {counted(len(cameras), 'camera')}")
@@ -182,11 +187,6 @@ def _moving(
     return [dataclasses.replace(each, seed=seeds[each.seed]) for each in wanted], note
 
 
-def _sequence_of(catalogue: Catalogue, provenance: Provenance) -> VideoSequence:
-    (video,) = (video for video in catalogue.videos if video.id == provenance.video)
-    return VideoSequence(video, provenance.start_frame)
-
-
 def _content(kind: str, whole: Camera | None, cameras: Sequence[Camera], title: str, moments: int) -> bytes | str:
     if kind == ".png":
         return png_bytes(draw_sheet(cameras, title, moments=moments, whole=whole))
@@ -205,11 +205,8 @@ def _content(kind: str, whole: Camera | None, cameras: Sequence[Camera], title: 
 
 def _camera(
     catalogue: Catalogue, wanted: PreviewCamera, spec: Mapping[str, Any], with_flow: bool, notes: dict[str, list[str]]
-) -> tuple[Camera, MeasuredMotion, npt.NDArray[np.float64]]:
-    """Make one camera's clip; measure what moves in it, and count what its start makes.
-
-    Adds the titles of the cameras that a note is about to ``notes``, by its text.
-    """
+) -> tuple[Camera, RemadeSample]:
+    """Make one camera's clip. Adds the titles of the cameras that a note is about to ``notes``, by its text."""
     title = wanted.title or f"seed {wanted.seed}"
     asked = StreamSpec.from_dict({**spec, "recipe": wanted.recipe})
     stream = _fitted_stream(catalogue, spec, wanted.recipe)
@@ -223,9 +220,13 @@ def _camera(
         notes.setdefault(note, []).append(title)
     sidecars = catalogue.sidecars
     labels = [name for name in LABELS if any(sidecars[each].fingerprints for each in sidecar_endings((name,)))]
-    if catalogue.kind == "photographs":
-        labels = ["masks", "tracks"]
-    arrays = ("voxels", "frames", *(("flow",) if with_flow else ()), *labels)
+    arrays = (
+        "voxels",
+        "frames",
+        *(["frames_blurred"] if any(stream.recipe.exposure_seconds) else ()),
+        *(("flow",) if with_flow else ()),
+        *(catalogue.kind.shown_arrays or labels),
+    )
     made = Remaker(catalogue, stream, arrays).made(wanted.seed, 0, 0)
     provenance = made.sample.provenance
     if note := _signal_note(catalogue, provenance, stream.recipe):
@@ -234,9 +235,7 @@ def _camera(
     camera = Camera.of(made.sample.arrays, provenance, title, stream.recipe, whole)
     quiet_grids = quiet_voxels(made).reshape(-1, *camera.voxels.shape[1:])
     quiet = dataclasses.replace(camera, voxels=quiet_grids[camera.lead_voxels :])
-    rate = _sequence_of(catalogue, provenance).video.frames_per_second
-    timed = dataclasses.replace(camera, quiet=quiet.rates, step_seconds=stream.recipe.frame_stride / rate)
-    return timed, measured_motion(made), start_events(made)
+    return dataclasses.replace(camera, quiet=quiet.rates, step_seconds=step_seconds(made.job.clip)), made
 
 
 def _signal_note(catalogue: Catalogue, provenance: Provenance, recipe: Recipe) -> str:
@@ -304,9 +303,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         "sources", nargs="+", metavar="VIDEO|DIR",
         help="a video, a folder of videos, or a list file; with several, each gets a FILE-NAME of its own",
     )  # fmt: skip
-    parser.add_settings(
-        ServeConfig, "list", "rows", "videos_kind", "rate", "photograph_seconds", "picture_bits", "cache_dir"
-    )
+    parser.add_settings(ServeConfig, "list", "rows", "cache_dir")
+    parser.add_settings(KindFlags)
     out = parser.group("Output")
     parser.add_output(
         "Output", "--out", PICTURE_SUFFIXES, f"picture, film or page: {', '.join(PICTURE_SUFFIXES)}", required=True
@@ -341,8 +339,8 @@ def _run(arguments: argparse.Namespace) -> None:
         what = f'virtual cameras drawn from the recipe "{Path(name).stem}"'
     for each in wanted:
         each.recipe.warn()
-    kind = VideosKind.of(vars(arguments))
-    if arguments.seed is None and not kind.is_rendered:
+    kind = kind_from(vars(arguments))
+    if arguments.seed is None and kind.has_motion:
         what += ", chosen where something moves"
     stem, names = arguments.out.stem, [Path(source).stem for source in arguments.sources]
     named = {

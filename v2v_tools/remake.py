@@ -11,23 +11,25 @@ from v2v_protocol.programs import counted
 from v2v_protocol.progress import Progress
 from v2v_protocol.sample import DEFAULT_ARRAYS, Refusal, RefusalKind, Sample, SampleId, array_layout
 from v2v_protocol.spec import StreamSpec
-from v2v_server.broker import dispatcher
-from v2v_server.broker.dispatcher import next_candidate
+from v2v_server.broker import assignment
+from v2v_server.broker.candidates import next_candidate
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, complete_lease, open_catalogue
+from v2v_server.kinds.kind import VideosKind
 from v2v_server.quarantine import Quarantine
 from v2v_server.schedule import MOST_CANDIDATES, Schedule, SequenceTable, VideoSequence
-from v2v_server.store.pixels import VideosKind
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
-from v2v_server.worker.produce import Decoded, decode_for, list_sample_events, make_sample, open_sidecars
+from v2v_server.worker.job import SampleJob
+from v2v_server.worker.making.make import list_sample_events, make_sample
+from v2v_server.worker.making.read import Decoded, decode_for, open_sidecars
 
 
 @dataclass(frozen=True, slots=True)
 class RemadeSample:
-    """A sample, the lease it was made for, and the frames it was made of."""
+    """A sample, its job, and the frames it was made of."""
 
-    lease: Lease
+    job: SampleJob
     decoded: Decoded
     sample: Sample
 
@@ -42,6 +44,7 @@ class Remaker:
         quarantine, snapshot: the quarantine and the snapshot to make them under; the empty one by default.
 
     Attributes:
+        catalogue, spec: as given.
         count: samples of an epoch.
 
     Raises:
@@ -59,7 +62,7 @@ class Remaker:
     ) -> None:
         array_layout(spec.recipe, spec.voxel_dtype, arrays)
         catalogue.facts.require_arrays(arrays)
-        self._catalogue, self._spec, self._arrays = catalogue, spec, arrays
+        self.catalogue, self.spec, self._arrays = catalogue, spec, arrays
         self._quarantine, self._snapshot = quarantine or Quarantine(), snapshot
         table = SequenceTable(catalogue.videos, catalogue.rows, spec)
         if not table.count:
@@ -67,9 +70,20 @@ class Remaker:
         self._schedule = Schedule(table, spec)
         self.count = self._schedule.count
 
-    def sequence(self, seed: int, epoch: int, index: int) -> VideoSequence:
-        """Return the sequence that the sample of this name is made from if it can be read."""
-        return self._schedule.candidate(seed, epoch, index, 0)
+    def job(self, seed: int, epoch: int, index: int) -> SampleJob:
+        """Return the job of the sample of this name, from the video that it is made of if that can be read.
+
+        Raises:
+            IndexUnreadable, V2VError: see :func:`lease_for`.
+        """
+        return self._job(seed, Request(b"", epoch, index), self._schedule.candidate(seed, epoch, index, 0))
+
+    def _job(self, seed: int, request: Request, sequence: VideoSequence) -> SampleJob:
+        return SampleJob.of(
+            lease_for(
+                request, sequence=sequence, catalogue=self.catalogue, spec=self.spec, seed=seed, arrays=self._arrays
+            )
+        )
 
     def sample(self, seed: int, epoch: int, index: int) -> Sample:
         """Make the sample of this name, candidates and refusals included: see :meth:`made`."""
@@ -78,7 +92,7 @@ class Remaker:
     def events(self, seed: int, epoch: int, index: int) -> EventList:
         """List the events of a sample with the times of their crossings. Errors: :meth:`made`."""
         remade = self.made(seed, epoch, index)
-        return list_sample_events(remade.lease, remade.decoded)
+        return list_sample_events(remade.job.clip, remade.decoded)
 
     def made(self, seed: int, epoch: int, index: int) -> RemadeSample:
         """Make the sample of this name, and return what it was made of too.
@@ -89,7 +103,7 @@ class Remaker:
             SidecarError: a file beside the video, which an array is made from, cannot be used.
             VideoUnreadable: this host cannot read a candidate's file, which a server may have read.
         """
-        catalogue, spec = self._catalogue, self._spec
+        catalogue, spec = self.catalogue, self.spec
         SampleId(spec.digest, catalogue.facts.digest_under(spec.scene), 0, seed, epoch, index)
         if index >= self.count:
             raise UsageError(f"index {index}: the epoch has {counted(self.count, 'sample')}, 0 .. {self.count - 1}")
@@ -104,17 +118,15 @@ class Remaker:
             if condemned is not None:
                 request = next_candidate(request, Refusal(video.id, None, condemned, RefusalKind.QUARANTINED))
                 continue
-            lease = lease_for(
-                request, sequence=sequence, catalogue=catalogue, spec=spec, seed=seed, arrays=self._arrays
-            )
+            job = self._job(seed, request, sequence)
             try:
-                decoded = decode_for(lease, lease.indices, catalogue.source)[0]
-                with open_sidecars(lease, catalogue.source) as sidecars:
-                    return RemadeSample(lease, decoded, make_sample(lease, decoded, sidecars=sidecars))
+                decoded = decode_for(job.clip, (index,), catalogue.source)[0]
+                with open_sidecars(job.clip, catalogue.source) as sidecars:
+                    return RemadeSample(job, decoded, make_sample(job, decoded, sidecars=sidecars))
             except VideoError as error:
-                if isinstance(error, VideoUnreadable) and not _is_left_out(catalogue, lease.video):
+                if isinstance(error, VideoUnreadable) and not _is_left_out(catalogue, video.id):
                     raise
-                request = next_candidate(request, Refusal(lease.video, error.frame, error.reason))
+                request = next_candidate(request, Refusal(video.id, error.frame, error.reason))
         refusals = "; ".join(dict.fromkeys(map(str, request.refusals)))
         raise SampleUnavailable("unavailable", f"sample {index} of epoch {epoch}: {refusals}")
 
@@ -177,12 +189,12 @@ def lease_for(
     number: int = 1,
     siblings: tuple[int, ...] = (),
 ) -> Lease:
-    """Build the lease that a server sends for a request; see :func:`v2v_server.broker.dispatcher.lease_for`.
+    """Build the lease that a server sends for a request; see :func:`v2v_server.broker.assignment.lease_for`.
 
     Raises:
         IndexUnreadable, V2VError: as of :func:`v2v_server.corpus.catalogue.complete_lease`.
     """
-    lease = dispatcher.lease_for(
+    lease = assignment.lease_for(
         request,
         sequence=sequence,
         facts=catalogue.facts,

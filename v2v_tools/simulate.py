@@ -17,15 +17,12 @@ from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.programs import show
 from v2v_protocol.sample import ARRAYS, DEFAULT_ARRAYS
-from v2v_protocol.spec import StreamSpec
-from v2v_protocol.spec_flags import add_spec, asked_recipe, recipe_setting, spec_fields
+from v2v_protocol.spec_flags import add_spec
 from v2v_protocol.write_aside import write_aside_and_rename
-from v2v_server.config import ServeConfig
-from v2v_server.quarantine import Quarantine, quarantine_path, read_quarantine
-from v2v_server.store.pixels import VideosKind
-from v2v_server.worker.produce import list_sample_events
-from v2v_tools.event_files import EVENT_WRITERS, check_event_file, write_events
-from v2v_tools.remake import Remaker, open_shown
+from v2v_recordings.writers import ENDINGS, check_form, form_of, write_events
+from v2v_server.worker.making.make import list_sample_events
+from v2v_tools import sample_set, whole
+from v2v_tools.sample_flags import add_samples, asked_remaker, asked_spec
 
 _MOMENTS = 4
 """Voxel grids that a picture shows."""
@@ -33,6 +30,11 @@ _MOMENTS = 4
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status."""
+    given = {word.partition("=")[0] for word in (sys.argv[1:] if argv is None else argv)}
+    if "--whole" in given:
+        return whole.main(argv)
+    if "--count" in given:
+        return sample_set.main(argv)
     parser = Parser(
         "v2v-simulate", "VIDEO --out FILE.npz [flags]",
         "Make one sample in this process: the same bytes a server would stream.",
@@ -41,20 +43,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             "v2v-simulate webvid10k/ --rows top:0.54 --seed 3 --epoch 2 --index 4711 --out sample.npz",
         ],
     )  # fmt: skip
-    which = parser.group("Which sample")
-    which.add_argument("video", metavar="VIDEO", help="a video; or a folder or list file, to remake a streamed sample")
-    which.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the stream (default 0)")
-    which.add_argument("--epoch", type=int, default=0, metavar="N", help="default 0")
-    which.add_argument("--index", type=int, default=0, metavar="N", help="global index in the epoch (default 0)")
+    which = add_samples(parser)
     which.add_argument(
-        "--quarantine",
-        type=int,
-        default=0,
-        metavar="N",
-        help="number of the quarantine snapshot in the sample's provenance",
+        "--whole", action="store_true", help="make events of whole videos instead: see v2v-simulate --whole --help"
     )
-    parser.add_settings(
-        ServeConfig, "list", "rows", "videos_kind", "rate", "photograph_seconds", "picture_bits", "cache_dir"
+    which.add_argument(
+        "--count", metavar="N", help="write N samples as recordings instead: see v2v-simulate --count --help"
     )
     out = parser.group("Output")
     parser.add_output(
@@ -64,8 +58,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_output(
         "Output",
         "--events",
-        tuple(EVENT_WRITERS),
-        f"also write the events with their times: {', '.join(EVENT_WRITERS)}",
+        tuple(ENDINGS),
+        f"also write the events with their times: {', '.join(ENDINGS)}",
     )
     out.add_argument(
         "--arrays", default=",".join(DEFAULT_ARRAYS), metavar="NAME,NAME",
@@ -79,23 +73,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(asked: argparse.Namespace) -> None:
     """Make one sample, and write it: the requested arrays and ``provenance``, a JSON text."""
-    spec = StreamSpec.from_dict(spec_fields(asked) | {"recipe": recipe_setting(asked_recipe(asked), asked.set)})
-    spec.recipe.warn()
+    spec = asked_spec(asked)
     arrays = tuple(asked.arrays.split(","))
     if asked.picture is not None:
         check_drawable(arrays)
     if asked.events is not None:
-        check_event_file(asked.events, spec.recipe.crop_width_px, spec.recipe.crop_height_px)
-    catalogue = open_shown(
-        asked.video, list_file=asked.list, rows=asked.rows or "full", scene=spec.scene != "off",
-        cache_dir=asked.cache_dir, kind=VideosKind.of(vars(asked)),
-    )  # fmt: skip
-    path = quarantine_path(catalogue.source.name, asked.cache_dir)
-    quarantine = read_quarantine(path) if asked.quarantine else Quarantine()
-    quarantine.entries(asked.quarantine)  # before any work: whether there is such a snapshot
-    for refusal in catalogue.refusals:
-        show(f"cannot be used: {refusal}")
-    remaker = Remaker(catalogue, spec, arrays, quarantine, asked.quarantine)
+        check_form(asked.events, form_of(asked.events), spec.recipe.crop_px[::-1])
+    remaker = asked_remaker(asked, spec, arrays)
     remade = remaker.made(asked.seed, asked.epoch, asked.index)
     sample, provenance = remade.sample, remade.sample.provenance
     content: dict[str, Any] = {**sample.arrays, "provenance": json.dumps(provenance.to_dict())}
@@ -106,7 +90,7 @@ def _run(asked: argparse.Namespace) -> None:
             camera = Camera.of(sample.arrays, provenance, f"index {asked.index}", spec.recipe)
             write_png(asked.picture, draw_sheet([camera], f"seed {asked.seed}, epoch {asked.epoch}", moments=_MOMENTS))
         if asked.events is not None:
-            events = list_sample_events(remade.lease, remade.decoded)
+            events = list_sample_events(remade.job.clip, remade.decoded)
             write_events(asked.events, events)
             show(f"{len(events)} events written to {asked.events}")
     except OSError as error:

@@ -36,7 +36,7 @@ from v2v_protocol.recipe import preset
 from v2v_server.flow import AUTO, METHODS, Estimator, choose, estimator
 from v2v_server.simulation.draw import draw
 from v2v_server.video.probe import probe
-from v2v_server.worlds.render import WHITEST, flow_of, pyramid_of, render
+from v2v_server.worlds.render import flow_of, pyramid_of, render
 from v2v_server.worlds.world import draw_world
 
 HEIGHT_PX, WIDTH_PX, CROP_PX = 180, 596, 128
@@ -152,7 +152,7 @@ def beside_worlds(names: Sequence[str], count: int) -> list[dict[str, Any]]:
         params = draw(recipe, seed=1, epoch=0, index=number, picture_height_px=grey.shape[0],
                       picture_width_px=grey.shape[1], video_id="")  # fmt: skip
         world = draw_world(recipe, params, seed=1, epoch=0, index=number, picture_px=grey.shape, seconds=(-1.0, 1.0))
-        first, second = (render(pyramid_of(grey), world, moments) * (255.0 / WHITEST)).round().astype(np.uint8)
+        first, second = (render(pyramid_of(grey), world, moments) * (255.0 / 4095.0)).round().astype(np.uint8)
         exact, valid = flow_of(world, *moments.tolist())
         hidden = cv2.dilate(1 - valid[0], np.ones((2 * HIDDEN_PX + 1,) * 2, np.uint8))
         lengths.append(np.hypot(*exact)[inner, inner])

@@ -123,6 +123,11 @@ def networks(asked: argparse.Namespace) -> dict[str, VoxelNetwork]:
 def add_flags(parser: Parser) -> None:
     """Add the bench's flags."""
     parser.add_argument("--held-out", required=True, metavar="DIR", help="videos that no network was trained on")
+    add_networks(parser)
+
+
+def add_networks(parser: Parser) -> None:
+    """Add the flags of the networks to judge, the photographs to judge them on, and LPIPS."""
     parser.add_argument("--photographs", metavar="DIR", help="photographs that none was trained on: cameras `worlds`")
     for flag, what in (
         ("--weights", "a network to judge, may be repeated"),

@@ -1,12 +1,19 @@
-"""Write recordings of cameras outside the training's family, with true pictures, for `v2v-eval`.
+"""Write recordings of cameras outside the training's family, with true pictures, and say which network ships.
 
     python -m bench recordings --out DIR --video osp_diabolo_240fps.mp4
     v2v-eval --data DIR --window-seconds 0.01 --weights FILE --metrics correlation,lpips_squeeze --lpips squeeze ...
+    python -m bench recordings --out DIR --video osp_diabolo_240fps.mp4 --photographs HELD_OUT_DIR \\
+        --weights shipped=trainer/shipped/firenet.pt --ema-weights mine=runs/firenet-cpu/last.pt \\
+        --normalized-weights published=firenet.pth --lpips squeeze BACKBONE HEADS
 
 Each scene of ``tests/oracles/rendered.py``, at the given speeds, and the liveliest part of each film of high frame rate
 is seen by a camera of its own, event by event with exact times: thresholds from 0.15 to 0.4 that differ by pixel, a
 low-pass, a refractory period, noise events. No sample of the stream is made this way. A picture every 20 ms is the
 truth; the first 100 ms, in which a network has seen little, have none.
+
+With networks, it applies the rule of the model card (``bench/accuracy/rule.py``) to those of `--weights` and
+`--ema-weights`, on windows of a quarter of an event a pixel and on samples of `--photographs`. Those of
+`--normalized-weights` take interpolated voxel grids; they are shown beside and are no candidates.
 """
 
 from __future__ import annotations
@@ -18,14 +25,17 @@ from typing import Any
 
 import numpy as np
 
+from bench.accuracy import learn, rule
 from bench.accuracy.physics import liveliest
-from bench.frame import Column, Report, add_whole, progress
+from bench.frame import Column, Record, Report, add_whole, progress
 from tests.oracles.decoded import decode_luma
 from tests.oracles.dense import dense_events
 from tests.oracles.rendered import GAMMA, NAMES, Reals, rendered_scene
-from trainer.convert.writer import RecordingWriter
+from trainer.evaluation.metrics import make_metrics
 from v2v_protocol.command import Parser
+from v2v_protocol.errors import UsageError
 from v2v_recordings.items import EventChunk, Picture
+from v2v_recordings.layout_writer import RecordingWriter
 from v2v_server.video.probe import probe
 
 SECONDS, RENDERED_HZ, PICTURE_EVERY_SECONDS, FIRST_SECONDS = 0.6, 800.0, 0.02, 0.1
@@ -37,6 +47,15 @@ _COLUMNS: tuple[Column, ...] = (
     ("threshold_pos", "c+", "{:.2f}", 1),
     ("threshold_neg", "c-", "{:.2f}", 1),
     ("corner_hz", "low-pass, Hz", "{:.0f}", 1),
+)
+_JUDGED: tuple[Column, ...] = (
+    ("network", "network", "{}", 1),
+    ("data", "data", "{}", 1),
+    ("windows", "windows", "{:.0f}", 1),
+    ("lpips", "LPIPS", "{:.3f}", 1),
+    ("correlation", "correlation", "{:.3f}", 1),
+    ("mse", "squared error", "{:.4f}", 1),
+    ("grey_mse", "of a constant grey", "{:.4f}", 1),
 )
 
 
@@ -90,10 +109,43 @@ def add_flags(parser: Parser) -> None:
     parser.add_argument("--video", action="append", default=[], type=Path, metavar="FILE", help="film of high rate")
     add_whole(parser, "--side", 128, "side of the pictures, px", least=32)
     add_whole(parser, "--seed", 0, "seed of the cameras", least=0)
+    learn.add_networks(parser)
+
+
+def judged(asked: argparse.Namespace) -> Report:
+    """Judge networks on the recordings and on worlds; return their figures, and what the rule says.
+
+    Raises:
+        UsageError: a file of weights is missing or wrong, or ``--photographs`` or ``--lpips`` is.
+    """
+    if asked.photographs is None or asked.lpips is None:
+        raise UsageError("the rule needs --photographs DIR and --lpips NET BACKBONE HEADS beside the networks")
+    networks = learn.networks(asked)
+    candidates = {entry.partition("=")[0] for entry in [*asked.weights, *asked.ema_weights]}
+    lpips = f"lpips_{asked.lpips[0]}"
+    metrics = make_metrics([lpips, "correlation", "mse"], {asked.lpips[0]: tuple(asked.lpips[1:])})
+    (worlds,) = learn.held_out(asked.photographs, "photographs", learn.PHOTOGRAPHS, asked.samples).values()
+    records: list[Record] = []
+    by_grids: list[Record] = []
+    means: dict[str, dict[str, float]] = {}
+    for name, network in networks.items():
+        progress(f"judging {name}")
+        recorded, parts = rule.on_recordings(
+            asked.out, network, metrics, asked.side**2 // 4, published=name not in candidates
+        )
+        kinds = {"recordings": recorded, "worlds": rule.on_worlds(worlds, network, metrics)}
+        means[name] = rule.mean_of(list(kinds.values()), lpips)
+        shown = {kind: rule.mean_of([figures], lpips) for kind, figures in kinds.items()} | {"mean": means[name]}
+        records += [{"network": name, "data": kind, **figures} for kind, figures in shown.items()]
+        by_grids += [{"network": name, "data": part, **rule.mean_of([each], lpips)} for part, each in parts.items()]
+    verdict = rule.apply({name: means[name] for name in networks if name in candidates})
+    lines = [f"{name} is out: {why}" for name, why in verdict.out.items()]
+    tables = [(records, _JUDGED), (by_grids, _JUDGED)]
+    return Report([*records, *by_grids], tables, [f"ships: {verdict.ships or 'none, all are out'}", *lines])
 
 
 def measure(asked: argparse.Namespace) -> Report:
-    """Write the recordings; return one record for each."""
+    """Write the recordings; return one record for each, and what :func:`judged` returns."""
     records: list[dict[str, Any]] = []
     for number, (name, light, hz) in enumerate(scenes(asked.side, asked.video)):
         events, drawn = seen(light, hz, np.random.default_rng((asked.seed, number)))
@@ -104,4 +156,8 @@ def measure(asked: argparse.Namespace) -> Report:
                 writer.add(Picture(round(step / hz * 1e9), np.rint(255 * light[step]).astype(np.uint8)))
         records.append({"recording": name, **drawn})
         progress(f"{asked.out / name}.h5")
-    return Report(records, [(records, _COLUMNS)])
+    written = Report(records, [(records, _COLUMNS)])
+    if not (asked.weights or asked.ema_weights or asked.normalized_weights):
+        return written
+    found = judged(asked)
+    return Report([*records, *found.records], [*written.tables, *found.tables], found.lines)

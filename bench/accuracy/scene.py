@@ -34,7 +34,8 @@ from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.sources.source import VideoSource
 from v2v_server.flow import flow_for, one_thread
 from v2v_server.schedule import SequenceTable
-from v2v_server.worker.produce import Decoded, decode_for
+from v2v_server.worker.job import ClipJob
+from v2v_server.worker.making.read import Decoded, decode_for
 from v2v_server.worker.scene_choice import TOLERANCE_PX
 from v2v_tools.remake import lease_for
 
@@ -74,13 +75,14 @@ def _record_of(leases: Sequence[Lease], source: VideoSource) -> dict[str, Any]:
     record: dict[str, Any] = {"measure": "clip", "video": leases[1].video, "start_frame": leases[1].start_frame}
     flows = []
     for scene, lease in zip(SCENES, leases, strict=True):
-        decoded = decode_for(lease, lease.indices, source)[0]
+        clip = ClipJob.of(lease)
+        decoded = decode_for(clip, lease.indices, source)[0]
         started = time.process_time()
-        flows.append(_flow(decoded))
+        flows.append(_flow(clip, decoded))
         record[f"flow_{scene}_cpu_seconds"] = time.process_time() - started
         plan = decoded.plan.flow_plan
         if scene == "off":
-            truth = _flow(decoded, _REFERENCE)
+            truth = _flow(clip, decoded, _REFERENCE)
     compared = np.linspace(0, len(truth) - 1, _COMPARED_VOXELS).round().astype(int)
     for scene, flow in zip(SCENES, flows, strict=True):
         error = np.linalg.norm(flow[compared] - truth[compared].astype(np.float32), axis=1)
@@ -90,13 +92,13 @@ def _record_of(leases: Sequence[Lease], source: VideoSource) -> dict[str, Any]:
     return record | {"decision": "" if plan is None else plan.reason.partition(";")[0]}
 
 
-def _flow(decoded: Decoded, method: str | None = None) -> npt.NDArray[np.float16]:
+def _flow(clip: ClipJob, decoded: Decoded, method: str | None = None) -> npt.NDArray[np.float16]:
     """Return flow [T, 2, H, W] as a worker makes it, or by one method."""
     plan = decoded.plan
     assert plan.flow is not None  # the lease asks for flow
     settings = plan.flow if method is None else replace(plan.flow, method=method)
     methods = plan.flow_plan.methods if plan.flow_plan is not None and method is None else ()
-    return flow_for(decoded.clip.frames, plan.params, plan.spec.recipe, settings, plan=methods).flow
+    return flow_for(decoded.clip.frames, plan.params, clip.spec.recipe, settings, plan=methods).flow
 
 
 def total_of(clips: Sequence[Record]) -> dict[str, Any]:

@@ -5,18 +5,24 @@
 
 All simulators get the same pixels, frames and times, once for each light (``--light``). Times of frames are corrected
 where the recording tells their offset. Pixels at or near white are left out: frames do not show what a lamp does.
-"equations" are those of the paper, event by event in float64. A peer is the folder of its source, which is imported;
-"eventcv=" is the installed package.
+"equations" and "esim" are those of the paper and of ESIM, event by event in float64. A peer is the folder of its
+source, which is imported; "eventcv=" is the installed package. "v2e-noisy" is v2e with its noisy parameters, "v2v" the
+code that the paper's authors released. ``NAME, quiet`` is a recipe without its noise.
 
-A row has the means over draws and over the steps between frames: correlation of signed events a pixel, and of each
-polarity; |log ratio| of the number of events, whose mean sign is the ratio; distance of the distributions of intervals
-between events (half the sum of the differences); share of the sensor's active pixels that are missed, and of the
-simulator's that are invented; "mirrored", the correlation with the sensor's events mirrored, which no simulator earns.
-"ceiling" is the correlation of the frames' own change. "at" is the threshold: the camera's own, the one of five with
-the best correlation, and the one that gives the sensor's number of events.
+"at" is the threshold: the camera's own, the one of five with the best correlation, and the one that gives the sensor's
+number of events. What is chosen is chosen on the even of eight stripes of the sensor (:data:`CHOOSES`); all figures are
+those of the odd ones. A row has the means over draws and over the steps between frames: correlation of signed events a
+pixel, and of each polarity; |log ratio| of the number of events, whose mean sign is the ratio; distance of the
+distributions of intervals between events (half the sum of the differences); share of the sensor's active pixels that
+are missed, and of the simulator's that are invented; "mirrored", the correlation with the sensor's events mirrored,
+which no simulator earns. "ceiling" is the correlation of the frames' own change. Rows of "all" are over all steps in
+the light that the recordings state. Their ranks are by correlation and by |log ratio|. An interval (90 %) is that of
+blocks of the sensor and steps, drawn again with replacement.
+
+``--json`` is written after each row, so a run that ends early leaves the rows before.
 
 Bar: at its own thresholds and in the light that the recordings state, ``davis346-running`` is ahead of ``paper``,
-``sensor`` and ``davis346`` in correlation and in |log ratio|, over all steps.
+``sensor`` and ``davis346`` in correlation and in |log ratio|, over all steps of at least two recordings.
 """
 
 from __future__ import annotations
@@ -31,37 +37,57 @@ from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from bench.frame import Column, Record, Report, add_whole, progress
 from tests.oracles.simulators import (
+    FIGURES,
     PEERS,
+    RECORDED,
     ROWS,
+    SIMULATED,
     Simulator,
-    compared,
     correlation,
     counts_of,
     equations,
+    esim,
+    figures,
     frame_offset,
     of_recipe,
     part_of,
+    tallied,
     within,
 )
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
+from v2v_protocol.write_aside import write_json
 from v2v_recordings.items import ConvertOptions, Light
 from v2v_tools.fit.increments import BRIGHTEST_GREY
-from v2v_tools.fit.interval import Doubles
+from v2v_tools.fit.interval import DRAWS as RESAMPLED
+from v2v_tools.fit.interval import LEVEL, SIDE, Doubles
 from v2v_tools.fit.recording import Recorded, read_recording
 
-RECIPES, NEW = ("paper", "sensor", "davis346"), "davis346-running"
+BEATEN, NEW = ("paper", "sensor", "davis346"), "davis346-running"
+RECIPES = (*BEATEN, "noise-free", "clean", NEW)
 THRESHOLDS = np.array([0.1, 0.18, 0.3, 0.5, 0.85])
 NEAR_WHITE_PX, DARK = 17, 0.03
-_COLUMNS: tuple[Column, ...] = tuple(
-    (key, key.replace("_", " "), "{}" if number < 5 else "{:.2f}", 1)
-    for number, key in enumerate((
-        "recording", "light", "simulator", "at", "steps", "threshold", "correlation", "ceiling", "brighter", "darker",
-        "log_ratio", "ratio", "intervals", "missed", "invented", "mirrored",
-    ))
+CHOOSES = np.arange(SIDE**2) % SIDE % 2 == 0
+"""Blocks of the sensor on which thresholds are chosen: its even stripes. The odd ones are reported."""
+
+
+def _columns(*keys: str) -> tuple[Column, ...]:
+    """Return columns: numbers with two decimals, but for those that count and that are texts."""
+    whole = ("recording", "light", "simulator", "at", "steps", "correlation_rank", "log_ratio_rank")
+    return tuple((key, key.replace("_", " "), "{}" if key in whole else "{:.2f}", 1) for key in keys)
+
+
+_COLUMNS = _columns(
+    "recording", "light", "simulator", "at", "steps", "threshold", "correlation", "ceiling", "brighter", "darker",
+    "log_ratio", "ratio", "intervals", "missed", "invented", "mirrored",
+)  # fmt: skip
+_RANKED = _columns(
+    "simulator", "at", "steps", "correlation", "correlation_low", "correlation_high", "correlation_rank", "log_ratio",
+    "log_ratio_low", "log_ratio_high", "log_ratio_rank", "ratio", "intervals", "missed", "invented",
 )  # fmt: skip
 
 
@@ -84,20 +110,74 @@ def seen(path: Path) -> tuple[Recorded, str]:
     return within(dataclasses.replace(part_of(given, usable), frame_us=given.frame_us + moved)), text
 
 
-def judged(given: Recorded, true: Doubles, simulator: Simulator, draws: int) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a simulator: at its own threshold, the best of five, the sensor's number of events."""
+@dataclasses.dataclass(frozen=True, eq=False)
+class Judged:
+    """Figures over some steps, in the order of FIGURES.
 
-    def means(threshold: float, count: int) -> dict[str, float]:
-        rows = [compared(given, true, simulator(given, threshold, seed)) for seed in range(count)]
-        mean = {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
-        return mean | {"threshold": threshold, "ratio": math.exp(mean["ratio"])}
+    Attributes:
+        value: [FIGURES] means over the steps.
+        drawn: [RESAMPLED, FIGURES] the same of blocks and steps drawn again.
+        steps: number of steps.
+    """
 
-    yield {"at": "own", **means(0.0, draws), "threshold": None}
-    rows = [means(threshold, max(1, draws // 5)) for threshold in THRESHOLDS]
-    yield {"at": "best", **max(rows, key=lambda row: row["correlation"])}
-    numbers = np.maximum.accumulate([row["events"] for row in rows[::-1]])
-    level = np.exp(np.interp(np.log(true.sum() + 0.5), np.log(numbers), np.log(THRESHOLDS[::-1])))
-    yield {"at": "number", **means(float(level), max(1, draws // 5))}
+    value: Doubles
+    drawn: Doubles
+    steps: int
+
+    def record(self) -> dict[str, float]:
+        """Return the figures and their intervals, by name; ``ratio`` is that of the numbers of events."""
+        ends = np.quantile(self.drawn, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)
+        made = {
+            f"{name}{end}": float(column[place])
+            for end, column in (("", self.value), ("_low", ends[0]), ("_high", ends[1]))
+            for place, name in enumerate(FIGURES)
+        }
+        return made | {name: math.exp(made[name]) for name in ("ratio", "ratio_low", "ratio_high")}
+
+
+def of_pieces(sums: Doubles) -> Judged:
+    """Return the figures of [draws, blocks, steps, SUMS] of ``tallied``: means over the draws and over the steps."""
+    _, blocks, steps, _ = sums.shape
+
+    def of_steps(weights: npt.NDArray[Any]) -> Doubles:
+        return np.asarray(figures(np.einsum("b,dbsk->dsk", weights, sums)).mean(axis=0))
+
+    rng = np.random.default_rng(0)  # the same pieces for every simulator
+    drawn = [
+        rng.multinomial(steps, np.full(steps, 1 / steps))
+        @ of_steps(rng.multinomial(blocks, np.full(blocks, 1 / blocks)))
+        for _ in range(RESAMPLED)
+    ]
+    return Judged(of_steps(np.ones(blocks)).mean(axis=0), np.stack(drawn) / steps, steps)
+
+
+def pooled(parts: list[Judged]) -> Judged:
+    """Return the figures over all steps of several recordings."""
+    steps = sum(part.steps for part in parts)
+    value, drawn = (sum(part.steps * getattr(part, name) for part in parts) / steps for name in ("value", "drawn"))
+    return Judged(value, drawn, steps)
+
+
+def judged(given: Recorded, true: Doubles, simulator: Simulator, draws: int) -> Iterator[tuple[str, float, Judged]]:
+    """Yield threshold's kind, threshold (0: the own) and figures: own, the best of five, the sensor's number of events.
+
+    The last two thresholds are chosen on one half of the sensor. The figures are those of the other.
+    """
+
+    def sums_at(threshold: float, count: int) -> Doubles:
+        return np.stack([tallied(given, true, simulator(given, threshold, seed)) for seed in range(count)])
+
+    yield "own", 0.0, of_pieces(sums_at(0.0, draws)[:, ~CHOOSES])
+    few = max(1, draws // 5)
+    each = [sums_at(threshold, few) for threshold in THRESHOLDS]
+    mine = [figures(sums[:, CHOOSES].sum(axis=1)).mean(axis=(0, 1)) for sums in each]
+    best = int(np.argmax([found[0] for found in mine]))
+    yield "best", float(THRESHOLDS[best]), of_pieces(each[best][:, ~CHOOSES])
+    made, wanted = (
+        [math.log(sums[:, CHOOSES][..., which].sum() + 0.5) for sums in each[::-1]] for which in (SIMULATED, RECORDED)
+    )
+    level = float(np.exp(np.interp(wanted[0], np.maximum.accumulate(made), np.log(THRESHOLDS[::-1]))))
+    yield "number", level, of_pieces(sums_at(level, few)[:, ~CHOOSES])
 
 
 def add_flags(parser: Parser) -> None:
@@ -117,14 +197,9 @@ def add_flags(parser: Parser) -> None:
 
 def measure(asked: argparse.Namespace) -> Report:
     """Judge all simulators on all recordings."""
-    simulators = {name: of_recipe(name) for name in (*RECIPES, NEW, *asked.recipe)} | {"equations": equations}
-    for entry in asked.peer:
-        name, _, folder = entry.partition("=")
-        if name not in PEERS:
-            raise UsageError(f"--peer {entry}: give one of {', '.join(PEERS)} as NAME=DIR")
-        sys.path[:0] = [folder] if folder else []
-        simulators[name] = PEERS[name]
-    records, lines = list[Record](), list[str]()
+    simulators, records, lines, failed = _simulators(asked), list[Record](), list[str](), dict[str, str]()
+    parts: dict[tuple[str, str], list[Judged]] = {}
+    names = []
     for path in sorted(asked.recordings.iterdir()) if asked.recordings.is_dir() else [asked.recordings]:
         try:
             given, text = seen(path)
@@ -132,35 +207,93 @@ def measure(asked: argparse.Namespace) -> Report:
             lines.append(f"left out: {error}")
             continue
         lines.append(text)
+        names.append(path.stem)
         for light in map(Light.parse, asked.light or ("linear", "2.2")):
             lit = dataclasses.replace(given, light=light)
             true, level = counts_of(lit), np.log(DARK + light.of(lit.frames))
-            ceiling = float(np.mean(list(map(correlation, np.diff(level, axis=0), true[1] - true[0]))))
+            reported = ~CHOOSES[lit.blocks()]
+            ceiling = float(np.mean(list(map(
+                correlation, np.diff(level, axis=0)[:, reported], (true[1] - true[0])[:, reported]
+            ))))  # fmt: skip
             lines.append(f"  {light.name}: the frames' own change correlates by {ceiling:.2f} with the events")
-            for name, simulator in simulators.items():
-                progress(f"{path.name}, {light.name}, {name}")
-                records += [
-                    {"recording": path.stem, "light": light.name, "stated": given.light == light, "simulator": name,
-                     "steps": true.shape[1], "ceiling": ceiling, **row}
-                    for row in judged(lit, true, simulator, asked.draws)
-                ]  # fmt: skip
+            for number, (name, simulator) in enumerate(simulators.items(), 1):
+                progress(f"{path.name}, light {light.name}: {name}, {number} of {len(simulators)}")
+                try:
+                    for at, threshold, found in judged(lit, true, simulator, asked.draws):
+                        is_stated = given.light == light
+                        records.append({
+                            "recording": path.stem, "light": light.name, "stated": is_stated, "simulator": name,
+                            "at": at, "steps": found.steps, "threshold": threshold or None, "ceiling": ceiling,
+                            **found.record(),
+                        })  # fmt: skip
+                        if is_stated:
+                            parts.setdefault((name, at), []).append(found)
+                        if asked.json is not None:
+                            write_json(asked.json, records)
+                except Exception as error:  # a peer's; the others go on
+                    if name not in asked_peers(asked):
+                        raise
+                    failed[name] = f"peer {name} failed: {type(error).__name__}: {error}"
+                    progress(failed[name])
+    whole = list(over_all({key: found for key, found in parts.items() if key[0] not in failed}))
+    if len(names) < 2:
+        lines.append(f"The bar needs at least 2 recordings and was not judged: {', '.join(names) or 'none'} was read")
     return Report(
-        records, [(records, _COLUMNS)],
+        [*records, *whole], [(records, _COLUMNS), (whole, _RANKED)],
         [*lines, "The light of a recording cannot be told from these figures: it has to be known."],
-        missed(records),
+        [*failed.values(), *(missed(whole) if len(names) > 1 else [])],
     )  # fmt: skip
 
 
-def missed(records: list[Record]) -> list[str]:
-    """Return the bars that the new preset misses, over all steps in the stated light."""
-    own = [record for record in records if record["at"] == "own" and record["stated"]]
+def asked_peers(asked: argparse.Namespace) -> dict[str, str]:
+    """Return the folders of the peers that the command line names.
 
-    def mean(name: str, key: str) -> float:
-        mine = [record for record in own if record["simulator"] == name]
-        return float(np.average([each[key] for each in mine], weights=[each["steps"] for each in mine]))
+    Raises:
+        UsageError: an unknown peer.
+    """
+    found = {}
+    for entry in asked.peer:
+        name, _, folder = entry.partition("=")
+        if name not in PEERS:
+            raise UsageError(f"--peer {entry}: give one of {', '.join(PEERS)} as NAME=DIR")
+        found[name] = folder
+    return found
 
+
+def _simulators(asked: argparse.Namespace) -> dict[str, Simulator]:
+    """Return the simulators by name; make the peers' sources importable."""
+    recipes = dict.fromkeys((*RECIPES, *asked.recipe))
+    quiet = {f"{name}, quiet": of_recipe(name, noisy=False) for name in dict.fromkeys((NEW, *asked.recipe))}
+    found = {name: of_recipe(name) for name in recipes} | quiet | {"equations": equations, "esim": esim}
+    for name, folder in asked_peers(asked).items():
+        sys.path[:0] = [folder] if folder else []
+        found[name] = PEERS[name]
+    return found
+
+
+def over_all(parts: dict[tuple[str, str], list[Judged]]) -> Iterator[Record]:
+    """Yield a row of each simulator and kind of threshold over all recordings, with its ranks and their intervals."""
+    for at in dict.fromkeys(kind for _, kind in parts):
+        found = {name: pooled(each) for (name, kind), each in parts.items() if kind == at}
+        ranks = dict[str, list[str]]()
+        for key, sign in (("correlation", -1), ("log_ratio", 1)):
+            place = FIGURES.index(key)
+            values = np.array([[each.value[place], *each.drawn[:, place]] for each in found.values()])
+            order = 1 + np.argsort(np.argsort(sign * values, axis=0, kind="stable"), axis=0)
+            ends = np.quantile(order[:, 1:], [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=1, method="nearest").T
+            ranks[key] = [f"{own[0]} ({low}-{high})" for own, (low, high) in zip(order, ends, strict=True)]
+        for number, (name, each) in enumerate(found.items()):
+            yield {
+                "recording": "all", "light": "stated", "stated": True, "simulator": name, "at": at,
+                "steps": each.steps, **each.record(), **{f"{key}_rank": ranks[key][number] for key in ranks},
+            }  # fmt: skip
+
+
+def missed(whole: list[Record]) -> list[str]:
+    """Return the bars that the new preset misses, from the rows over all recordings."""
+    own = {record["simulator"]: record for record in whole if record["at"] == "own"}
     return [
-        f"{key.replace('_', ' ')}: {NEW} {mean(NEW, key):.3f}, {name} {mean(name, key):.3f}"
-        for name in RECIPES if own for key, sign in (("correlation", 1), ("log_ratio", -1))
-        if sign * mean(NEW, key) <= sign * mean(name, key)
+        f"{key.replace('_', ' ')}: {NEW} {own[NEW][key]:.3f}, {name} {own[name][key]:.3f}"
+        for name in BEATEN if own for key, sign in (("correlation", 1), ("log_ratio", -1))
+        if sign * own[NEW][key] <= sign * own[name][key]
     ]  # fmt: skip

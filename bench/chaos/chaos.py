@@ -2,9 +2,10 @@
 
     python -m bench chaos --videos DIR --minutes 20 --json chaos.json
 
-One server, consumers with different specs, seeds and speeds (:mod:`bench.chaos.consumer`), and faults of many kinds
-(:mod:`bench.chaos.faults`). Then all processes are stopped, leftovers are counted, and the consumers' logs are compared
-with the schedule and with samples made here (:mod:`tests.oracles.stream`).
+One server, or with ``--brokers 2`` two that share one pool of workers; consumers with different specs, seeds and speeds
+(:mod:`bench.chaos.consumer`), and faults of many kinds (:mod:`bench.chaos.faults`). Then all processes are stopped,
+leftovers are counted, and the consumers' logs are compared with the schedule and with samples made here
+(:mod:`tests.oracles.stream`).
 
     recovery        from a kill to the next batch of the killed consumer, else of all consumers; after a kill of the
                     server only batches after its restart count
@@ -38,8 +39,8 @@ from tests.oracles.stream_log import BatchLine, Kill, read_log, recovery_seconds
 from v2v_client.loadtest import percentile
 from v2v_protocol.command import Parser
 from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.kinds.registry import VIDEOS
 from v2v_server.quarantine import quarantine_path, read_quarantine
-from v2v_server.store.video_file import id_of
 
 _POLL_SECONDS = 0.05
 _LAST_BATCH_SECONDS = 120.0
@@ -119,6 +120,7 @@ def record_of(
         "failures": len(fleet.failures),
         "seconds": seconds,
         "workers": fleet.workers,
+        "brokers": fleet.brokers,
         "consumers": fleet.consumers,
         "samples_per_second": verdict["sightings"] / seconds,
     }
@@ -159,7 +161,8 @@ def add_flags(parser: Parser) -> None:
     """Add the bench's flags."""
     add_source(parser)
     add_positive(parser, "--minutes", 2.0, "duration, minutes")
-    add_whole(parser, "--workers", 2, "workers of the server")
+    add_whole(parser, "--workers", 2, "workers of the server, or of the pool that several brokers share")
+    add_whole(parser, "--brokers", 1, "servers; with several, consumers take turns with them")
     add_whole(parser, "--consumers", 3, "consumers")
     add_positive(parser, "--every", 3.5, "mean time between faults, seconds")
     parser.add_argument("--faults", metavar="KIND,KIND", help=f"only these kinds, of {', '.join(WEIGHTS)}")
@@ -182,10 +185,10 @@ def measure(asked: argparse.Namespace) -> Report:
         fleet = Fleet(
             folder / "run", videos, asked.workers, consumers, LEASE_SECONDS, clip_cache=cache,
             keyed=asked.keys, server_flags=("--share-gib", "0.25") if asked.share else (),
-            further_bytes=1 << 30 if asked.large else 0,
+            further_bytes=1 << 30 if asked.large else 0, brokers=asked.brokers,
         )  # fmt: skip
         if asked.large:
             fleet.add_worker()  # it waits for the server
         # Two SIGSEGVs quarantine a video: one video must remain.
-        most_segv = sum(bool(id_of(path.name)) for path in videos.rglob("*")) - 1
+        most_segv = sum(bool(VIDEOS.id_of(path.name)) for path in videos.rglob("*")) - 1
         return run_fleet(fleet, Chaos(fleet, asked.every, asked.seed, most_segv, kinds), asked)

@@ -1,7 +1,7 @@
 """The faults of the chaos bench: their kinds, how often each occurs, and the processes that they hit.
 
-    worker-kill, -term, -segv     one of the server's workers ends by that signal
-    worker-hang                   one is stopped for good: the server's watchdog must end it
+    worker-kill, -term, -segv     one of the server's workers ends by that signal, or one of the pool
+    worker-hang                   one is stopped for good: the server's watchdog must end it; a pool has none
     worker-pause                  one is stopped and continues a little later
     further-add                   one more worker joins by `v2v-worker --connect`
     further-kill, -term           a further worker ends
@@ -29,7 +29,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 
-from bench.chaos.fleet import Fleet
+from bench.chaos.fleet import Fleet, Process
 from bench.chaos.hostile import KINDS
 
 WEIGHTS = {
@@ -142,19 +142,24 @@ class Chaos:
         who, _, how = kind.partition("-")
         if how == "segv" and sum(fault.kind == kind for fault in self.done) >= self.most_segv:
             return False
-        if who == "worker":
+        if who == "worker" and not self.fleet.pool:
             return bool(self.fleet.server_workers())
         if who == "server":
             # Kill only a ready server: otherwise a busy host may never serve the corpus.
-            return self.fleet.server.pid is not None and self.fleet.port_file.exists()
+            return self.fleet.is_ready
         if who == "peers":
             return now >= self._siege_until
         if who == "cache":
             return bool(self.fleet.cached_pieces())
         if how == "add":
             return len(self.fleet.further_workers) < _MOST_FURTHER_WORKERS
-        places = self.fleet.further_workers if who == "further" else self.fleet.crowd
-        return any(place.pid is not None for place in places)
+        return how != "hang" and any(place.pid is not None for place in self._places(who))
+
+    def _places(self, who: str) -> list[Process]:
+        fleet = self.fleet
+        return {
+            "server": fleet.servers, "worker": fleet.pool, "further": fleet.further_workers, "consumer": fleet.crowd
+        }[who]  # fmt: skip
 
     def _commit(self, kind: str, now: float) -> None:
         who, _, how = kind.partition("-")
@@ -168,18 +173,16 @@ class Chaos:
             self._lasting.append((self._siege_until, siege.close))
         elif who == "cache":
             self._spoil(how)
-        elif who == "worker":
+        elif who == "worker" and not self.fleet.pool:
             pids = self.fleet.server_workers()
             if not pids:
                 return  # the last one has ended meanwhile
             self._signal(self._random.choice(pids), how, now)
         else:
-            crowd = self.fleet.crowd
-            places = {"server": [self.fleet.server], "further": self.fleet.further_workers, "consumer": crowd}
-            alive = [(place, place.pid) for place in places[who]]
+            alive = [(place, place.pid) for place in self._places(who)]
             place, pid = self._random.choice([(place, pid) for place, pid in alive if pid is not None])
             place.expected = how != "pause"
-            consumer = crowd.index(place) if who == "consumer" else None
+            consumer = self.fleet.crowd.index(place) if who == "consumer" else None
             self._signal(pid, how, now)
         self.done.append(Fault(kind, now, consumer))
 
@@ -204,7 +207,7 @@ class Chaos:
         if how == "pause":
             longest = (
                 2.0 * self.fleet.lease_deadline_seconds
-                if pid in {place.pid for place in self.fleet.further_workers}
+                if pid in {place.pid for place in (*self.fleet.further_workers, *self.fleet.pool)}
                 else 4.0
             )
             self._lasting.append((now + self._random.uniform(0.2, longest), partial(_send, pid, signal.SIGCONT)))

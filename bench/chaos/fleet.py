@@ -1,4 +1,4 @@
-"""The processes of the chaos bench: a server with its workers, further workers, and consumers.
+"""The processes of the chaos bench: a server with its workers, or brokers that share a pool; more workers; consumers.
 
 The fleet starts them, restarts those that end, and stops them. Each has its TMPDIR in the run's folder, and a variable
 in its environment by which it is found after its parent has ended.
@@ -65,14 +65,19 @@ class Process:
         return "\n".join(lines[-most:]) or "(no output)"
 
 
+def port_file(server: Process) -> Path:
+    """Return the file that a server writes its address to once it is ready."""
+    return server.folder / "port"
+
+
 @dataclass(slots=True)
 class Fleet:
-    """A server, consumers and further workers.
+    """A server, or several brokers; consumers and further workers.
 
     Args:
         folder: a new folder for all files.
         videos: the corpus.
-        workers: of the server.
+        workers: of the server, or of the pool that several brokers share.
         consumers: their number.
         lease_deadline_seconds: of the server.
         server_module: module to run as the server.
@@ -82,11 +87,14 @@ class Fleet:
         elsewhere: prefix of the commands of consumers and further workers, to run them on another host.
         keyed: whether the server requires keys.
         further_bytes: limit of a further worker's memory, that of its control group; 0: none.
+        brokers: number of servers; several have no workers of their own. Consumers take turns with them.
 
     Attributes:
         failures: processes that ended without a fault.
         ready_at: when servers became ready, ascending.
-        address, worker_address: of the server, for consumers and for workers.
+        servers: the server, or all brokers.
+        pool: the workers that several brokers share.
+        addresses, worker_addresses: of the servers, for consumers and for workers.
     """
 
     folder: Path
@@ -101,43 +109,68 @@ class Fleet:
     elsewhere: tuple[str, ...] = ()
     keyed: bool = False
     further_bytes: int = 0
+    brokers: int = 1
     failures: list[str] = field(default_factory=list)
     ready_at: list[float] = field(default_factory=list)
     token: str = field(default_factory=lambda: f"{os.getpid()}-{time.monotonic_ns()}")
-    server: Process = field(init=False)
+    servers: list[Process] = field(init=False)
+    pool: list[Process] = field(init=False, default_factory=list)
     further_workers: list[Process] = field(init=False, default_factory=list)
     crowd: list[Process] = field(init=False)
-    address: str = field(init=False)
-    worker_address: str = field(init=False)
-    port_file: Path = field(init=False)
+    addresses: list[str] = field(init=False)
+    worker_addresses: list[str] = field(init=False)
     cache: Path = field(init=False)
     tally: Path = field(init=False)
     tmp: Path = field(init=False)
-    _awaited: bool = field(init=False, default=False)
+    _awaited: list[Process] = field(init=False, default_factory=list)
     _added: int = field(init=False, default=0)
 
     def __post_init__(self) -> None:
-        self.port_file, self.cache, self.tally, self.tmp = (self.folder / n for n in ("port", "cache", "tally", "tmp"))
-        for name in ("tmp", "cache", "server"):
+        self.cache, self.tally, self.tmp = (self.folder / name for name in ("cache", "tally", "tmp"))
+        for name in ("tmp", "cache"):
             (self.folder / name).mkdir(parents=True)
         if self.keyed:
             self._make_keys()
-        self.address, self.worker_address = (f"tcp://{self.host}:{port}" for port in free_ports(2))
-        self.server = Process("server", self._server_command(), self.folder / "server")
+        found = [f"tcp://{self.host}:{port}" for port in free_ports(2 * self.brokers)]
+        self.addresses, self.worker_addresses = found[: self.brokers], found[self.brokers :]
+        self.servers = [self._server(number) for number in range(self.brokers)]
+        if self.brokers > 1:
+            self.pool = [self._worker(f"pool{number}") for number in range(self.workers)]
         self.crowd = []
         for number in range(self.consumers):
             folder = self.folder / f"consumer{number}"
             folder.mkdir()
             command = [
                 *(*self.elsewhere, sys.executable, "-X", "faulthandler", "-m", "bench.chaos.consumer"),
-                *("--address", self.address, "--profile", str(number), "--folder", str(folder)),
+                *("--address", self.addresses[number % self.brokers], "--profile", str(number)),
+                *("--folder", str(folder)),
             ]
             self.crowd.append(Process(f"consumer {number}", command, folder, side="consumer"))
 
     @property
     def everyone(self) -> list[Process]:
         """Return all places."""
-        return [self.server, *self.further_workers, *self.crowd]
+        return [*self.servers, *self.pool, *self.further_workers, *self.crowd]
+
+    @property
+    def server(self) -> Process:
+        """Return the first server."""
+        return self.servers[0]
+
+    @property
+    def address(self) -> str:
+        """Return the first server's address for consumers."""
+        return self.addresses[0]
+
+    @property
+    def worker_address(self) -> str:
+        """Return the first server's address for workers."""
+        return self.worker_addresses[0]
+
+    @property
+    def is_ready(self) -> bool:
+        """Return whether all servers run and are ready."""
+        return all(place.pid is not None and port_file(place).exists() for place in self.servers)
 
     def key(self, name: str) -> Path:
         """Return the file of a key: "consumer", "worker", or "revoked", which was a consumer's."""
@@ -150,11 +183,14 @@ class Fleet:
             server.new(name, "worker" if name == "worker" else "consumer", self.key(name))
         server.revoke("revoked")
 
-    def _server_command(self) -> list[str]:
-        return [
+    def _server(self, number: int) -> Process:
+        name = f"server{number or ''}"
+        place = Process(name, [], self.folder / name)
+        place.folder.mkdir()
+        place.command = [
             *(sys.executable, "-m", self.server_module, "--videos", str(self.videos)),
-            *("--workers", str(self.workers)),
-            *("--bind", self.address, "--worker-bind", self.worker_address, "--port-file", str(self.port_file)),
+            *("--workers", str(self.workers if self.brokers == 1 else 0), "--bind", self.addresses[number]),
+            *("--worker-bind", self.worker_addresses[number], "--port-file", str(port_file(place))),
             *("--cache-dir", str(self.cache), "--lease-deadline-seconds", str(self.lease_deadline_seconds)),
             # The server's recipe only has to fit the corpus: every consumer states its own.
             *("--set", "voxels_per_clip=4", "--set", "crop_height_px=32", "--set", "crop_width_px=32"),
@@ -163,16 +199,20 @@ class Fleet:
             *(() if self.clip_cache is None else ("--cache", str(self.clip_cache), "--cache-gib", "4")),
             *(("--keys", str(self.folder / "keys")) if self.keyed else ()),
         ]
+        return place
 
     def start(self, start_seconds: float = 400.0) -> None:
-        """Start the server, then the consumers; wait until each consumer has saved a state.
+        """Start pool and servers, then the consumers; wait until each consumer has saved a state.
 
         Raises:
             UsageError: a process does not start; the message quotes its output.
         """
         deadline = time.monotonic() + start_seconds
-        self._spawn(self.server)
-        self.wait_for(lambda: bool(self.ready_at), deadline)
+        for worker in self.pool:  # they get ready while the servers start
+            self._spawn(worker)
+        for server in self.servers:  # one after the other: the first writes the index that all read
+            self._spawn(server)
+            self.wait_for(lambda: not self._awaited, deadline)
         for consumer in self.crowd:
             self._spawn(consumer)
         self.wait_for(lambda: min(self.committed()) > 0, deadline)
@@ -192,9 +232,9 @@ class Fleet:
             time.sleep(0.05)
 
     def restart(self, now: float) -> None:
-        """Restart the server and consumers that have ended, remove such further workers, note unexpected ends."""
-        if self._awaited and self.port_file.exists():
-            self._awaited = False
+        """Restart what has ended, remove such further workers, note unexpected ends."""
+        for server in [place for place in self._awaited if port_file(place).exists()]:
+            self._awaited.remove(server)
             self.ready_at.append(now)
         for place in self.everyone:
             status = None if place.process is None else place.process.poll()
@@ -209,8 +249,12 @@ class Fleet:
 
     def add_worker(self) -> None:
         """Start one more worker, as from another host."""
-        name = f"further{self._added}"
+        place = self._worker(f"further{self._added}")
         self._added += 1
+        self._spawn(place)
+        self.further_workers.append(place)
+
+    def _worker(self, name: str) -> Process:
         folder = self.folder / name
         folder.mkdir()
         module = ["v2v_server.commands.worker"]
@@ -219,11 +263,9 @@ class Fleet:
             module = [LIMITED_WORKER, str(folder / "limits")]
         command = [
             *(*self.elsewhere, sys.executable, "-m", *module),
-            *("--connect", self.worker_address, "--videos", str(self.videos), "--name", name),
+            *("--connect", ",".join(self.worker_addresses), "--videos", str(self.videos), "--name", name),
         ]
-        place = Process(f"worker {name}", command, folder, side="worker")
-        self._spawn(place)
-        self.further_workers.append(place)
+        return Process(f"worker {name}", command, folder, side="worker")
 
     @contextmanager
     def attacked(self, kind: str, *, last: bool = True) -> Iterator[subprocess.Popen[bytes]]:
@@ -269,9 +311,9 @@ class Fleet:
         return sum(path.stat().st_size for path in logs if path.exists())
 
     def _spawn(self, place: Process) -> None:
-        if place is self.server:
-            self.port_file.unlink(missing_ok=True)
-            self._awaited = True
+        if place in self.servers:
+            port_file(place).unlink(missing_ok=True)
+            self._awaited = [*(each for each in self._awaited if each is not place), place]
         place.expected = False
         with (place.folder / "stderr").open("ab") as errors:
             place.process = subprocess.Popen(
@@ -293,7 +335,7 @@ class Fleet:
             leftovers: processes that did not end or ended badly, and those of :meth:`traces`.
         """
         left = []
-        for place in (*self.crowd, *self.further_workers, self.server):
+        for place in (*self.crowd, *self.further_workers, *self.pool, *self.servers):
             if place.process is None:
                 continue
             if place.pid is not None:
@@ -327,7 +369,7 @@ class Fleet:
         _, alive = psutil.wait_procs(self.marked(), timeout=5.0)
         left = [f"process {process.pid}: {' '.join(process.info['cmdline'] or ())[:200]}" for process in alive]
         left += [f"zombie {each.pid}" for each in psutil.Process().children() if each.status() == psutil.STATUS_ZOMBIE]
-        for port in (int(address.rpartition(":")[2]) for address in (self.address, self.worker_address)):
+        for port in (int(address.rpartition(":")[2]) for address in (*self.addresses, *self.worker_addresses)):
             with socket.socket() as probe:
                 if probe.connect_ex((self.host, port)) == 0:
                     left.append(f"port {port} still listens")
@@ -335,8 +377,7 @@ class Fleet:
         left += [
             f"file {path.name}" for path in self.cache.iterdir() if path.name.endswith(("-wal", "-shm", "-journal"))
         ]
-        if self.port_file.exists():
-            left.append("the port file")
+        left += [f"the port file of {place.name}" for place in self.servers if port_file(place).exists()]
         return left
 
     def marked(self) -> list[psutil.Process]:

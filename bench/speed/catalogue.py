@@ -9,6 +9,12 @@ process opens the catalogue.
     open           seconds to open the catalogue, and processor time
     table          seconds to build the sequence table of the paper's recipe
     resident       memory that both added to the process, and the peak
+
+With --archive, the same names are made as a folder and as a tar file, and both are opened twice without an index: the
+first start probes each video. A sample's processor time is that of a decoded clip, the median of its turns.
+
+    first, second  seconds to open the catalogue at the first and the second start
+    sample         processor time of a clip
 """
 
 from __future__ import annotations
@@ -23,23 +29,28 @@ import tempfile
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bench.frame import Column, Report, add_whole
+from tests.packed import packed_forms
 from tests.pieces import shots
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_protocol.spec import StreamSpec
-from v2v_server.corpus.catalogue import index_path, open_catalogue
-from v2v_server.corpus.index import Figures, IndexRow, Store
+from v2v_server.corpus.catalogue import Catalogue, index_path, open_catalogue
+from v2v_server.corpus.index import Figures, Store
 from v2v_server.corpus.probe import SceneCollection, figures, probe_file
 from v2v_server.corpus.scenes.scene import COLUMNS, MOST_ANALYSED_FRAMES, SEGMENT_FRAMES, Scene
 from v2v_server.corpus.sources.folder import Folder
+from v2v_server.corpus.videos import IndexRow
+from v2v_server.kinds.registry import kind_of
 from v2v_server.schedule import SequenceTable
 from v2v_server.system.process import resident_bytes, usable_cores
+from v2v_server.video.decode import ClipRequest, Cut
 from v2v_server.video.rows import Rows
 
 _PER_FOLDER = 1000
@@ -52,6 +63,18 @@ _COLUMNS: tuple[Column, ...] = (
     ("resident_bytes", "resident MiB", "{:.0f}", 2.0**-20),
     ("peak_bytes", "peak MiB", "{:.0f}", 2.0**-20),
 )
+
+_ARCHIVE_COLUMNS: tuple[Column, ...] = (
+    ("form", "form", "{}", 1),
+    ("videos", "videos", "{}", 1),
+    ("first_seconds", "first s", "{:.2f}", 1.0),
+    ("second_seconds", "second s", "{:.3f}", 1.0),
+    ("sample_cpu_seconds", "sample CPU ms", "{:.2f}", 1e3),
+    ("first_ratio", "first ratio", "{:.2f}", 1.0),
+    ("second_ratio", "second ratio", "{:.2f}", 1.0),
+    ("sample_cpu_ratio", "sample ratio", "{:.3f}", 1.0),
+)
+_TURNS = 20
 
 
 def make_up(clip: Path, folder: Path, cache: Path, videos: int, scene: bool = False) -> None:
@@ -74,7 +97,7 @@ def make_up(clip: Path, folder: Path, cache: Path, videos: int, scene: bool = Fa
             (folder / id).parent.mkdir(parents=True)
         (folder / id).hardlink_to(copy)
         ids.append(id)
-    known = probe_file(Folder(folder), ids[0])
+    known = probe_file(Folder(folder), (ids[0], ()))
     if known.problem is not None:
         raise UsageError(f"--clip {clip}: {known.problem}")
     store = Store(index_path(folder.resolve(), cache))
@@ -123,16 +146,58 @@ def opened(folder: Path, cache: Path, scene: bool = False) -> dict[str, Any]:
     return record
 
 
+def compared(clip: Path, place: Path, videos: int) -> list[dict[str, Any]]:
+    """Return the records of a folder and of a tar file of it."""
+    for number in range(videos):
+        path = place / "folder" / "0" / f"{number:06}{clip.suffix}"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(clip, path)
+    records = []
+    for form, folder in packed_forms(place / "folder", place).items():
+        if form == "zip":
+            continue
+        record: dict[str, Any] = {"form": form, "videos": videos}
+        for start in ("first", "second"):
+            began = time.perf_counter()
+            catalogue = open_catalogue(folder, cache_dir=place / form, processes=usable_cores())
+            record[f"{start}_seconds"] = time.perf_counter() - began
+            if start == "first":
+                catalogue.close()
+        with closing(catalogue):
+            record["sample_cpu_seconds"] = _clip_seconds(catalogue)
+        records.append(record)
+    for name in ("first_seconds", "second_seconds", "sample_cpu_seconds"):
+        records[1][name.replace("seconds", "ratio")] = records[1][name] / records[0][name]
+    return records
+
+
+def _clip_seconds(catalogue: Catalogue) -> float:
+    """Return the processor time of a decoded clip of 41 frames: the median of the turns."""
+    turns = []
+    for video in catalogue.videos[:_TURNS]:
+        index = catalogue.frame_index(video.id)
+        request = ClipRequest(index, 0, (Cut(min(41, len(index)), (0, 0, video.height_px, video.width_px)),))
+        with catalogue.lend(video) as path, kind_of(video.id).open_pixels(path) as pixels:
+            began = time.process_time()
+            pixels.clips(request)
+            turns.append(time.process_time() - began)
+    return float(np.median(turns))
+
+
 def add_flags(parser: Parser) -> None:
     """Add the bench's flags."""
     parser.add_argument("--clip", required=True, type=Path, help="a short video of at least 201 frames")
     add_whole(parser, "--videos", 1_000_000, "names to make")
+    parser.add_argument("--archive", action="store_true", help="compare a folder and a tar file without an index")
     parser.add_argument("--scene", action="store_true", help="with scene data, as v2v-serve --scene auto")
 
 
 def measure(asked: argparse.Namespace) -> Report:
     """Run the bench."""
     with tempfile.TemporaryDirectory(prefix="v2v-catalogue-") as place:
+        if asked.archive:
+            records = compared(asked.clip, Path(place), asked.videos)
+            return Report(records, [(records, _ARCHIVE_COLUMNS)])
         folder, cache = Path(place, "videos"), Path(place, "cache")
         make_up(asked.clip, folder, cache, asked.videos, asked.scene)
         # The processes of a Pool must not have children.

@@ -47,8 +47,8 @@ from v2v_protocol.messages import (
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import Provenance, SampleId, SampleParams
 from v2v_server.system.process import die_with_parent, keep_freed_memory
+from v2v_server.worker.job import ClipJob
 from v2v_server.worker.process import open_output_buffer, pack, sample_message
-from v2v_server.worker.produce import sample_layout
 
 Ready = Mapping[str, npt.NDArray[Any]]  # Samples made ahead: [samples, ...] of each array
 
@@ -177,7 +177,7 @@ def answer(lease: Lease, name: str, samples: Ready | None = None) -> list[Any]:
     )
     if samples is not None:
         return _ready_message(lease, name, provenance, samples)
-    buffer = open_output_buffer(lease, sample_layout(lease))
+    buffer = open_output_buffer(lease, ClipJob.of(lease).layout)
     # Untouched memory is one shared page of zeros, which is nearly free to send.
     for array in buffer.arrays.values():
         array.fill(1)

@@ -25,7 +25,7 @@ from v2v_client.local_server import LocalServer
 from v2v_protocol.command import Parser
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import DEFAULT_ARRAYS, array_layout, layout_bytes
-from v2v_server.broker.dispatcher import MOST_CREDIT, suggested_credit
+from v2v_server.broker.admission import MOST_CREDIT, suggested_credit
 from v2v_server.system.process import usable_cores
 
 LEAST_GAIN_OF_TWO = 1.75

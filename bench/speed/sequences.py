@@ -25,7 +25,7 @@ from bench.frame import Column, Report, add_whole, beyond, medians, ratios
 from v2v_protocol.command import Parser
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.store.pixels import VideosKind
+from v2v_server.kinds.sequences import SequenceKind
 from v2v_tools.remake import Remaker
 
 HEIGHT_PX, WIDTH_PX, PATTERNS, MOST_RATIO = 64, 96, 50, 1.2
@@ -72,7 +72,7 @@ def measure(asked: argparse.Namespace) -> Report:
             write_pictures(Path(folder, f"{count}", "pictures"), count)
         time.sleep(SETTLED_SECONDS)
         for count in counts:
-            began, kind = time.perf_counter(), VideosKind("sequences", 25.0)
+            began, kind = time.perf_counter(), SequenceKind(25.0)
             catalogue = open_catalogue(Path(folder, f"{count}"), cache_dir=folder, kind=kind, processes=0)
             remakers.append(Remaker(opened.enter_context(closing(catalogue)), spec, ("voxels",)))
             middle = time.perf_counter()

@@ -147,7 +147,7 @@ def prepared(asked: argparse.Namespace) -> Iterator[dict[str, Any]]:
             top, bottom = catalogue.rows.bounds(video.height_px)
             index = catalogue.frame_index(video.id).to_bytes()
             job = Transcoding(
-                video, catalogue.path(video.id), DEFAULT_SIZE, root,
+                video, DEFAULT_SIZE, root, source=catalogue.path(video.id),
                 window=(top, 0, bottom - top, video.width_px), index=index,
             )  # fmt: skip
             fastest = {"prepare_cpu_seconds": math.inf, "prepare_scene_cpu_seconds": math.inf}

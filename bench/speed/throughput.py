@@ -48,7 +48,8 @@ from v2v_protocol.recipe import STREAM_PRESETS
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.system.process import usable_cores
-from v2v_server.worker.produce import decode_for
+from v2v_server.worker.job import ClipJob
+from v2v_server.worker.making.read import decode_for
 
 BASELINE, LIMIT = "released", "decode"
 # Least multiple of the baseline, by the clock and by processor time, as docs/performance.md reports it, on clips with a
@@ -138,7 +139,7 @@ class _Decoding(IterableDataset[int]):
         assert worker is not None  # a contender has at least one
         with open_leases(self._corpus.videos, self._corpus.rows, StreamSpec()) as (root, leases):
             for lease in itertools.islice(leases, worker.id, None, worker.num_workers):
-                decode_for(lease, lease.indices, Folder(root))
+                decode_for(ClipJob.of(lease), lease.indices, Folder(root))
                 yield 0
 
 

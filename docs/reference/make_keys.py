@@ -12,6 +12,7 @@ from v2v_protocol.recipe import EFFECTS_SECTION, PRESET_FIELDS, STREAM_PRESETS, 
 from v2v_protocol.settings import Setting, settings_of
 from v2v_protocol.spec import StreamSpec
 from v2v_server.config import ServeConfig
+from v2v_server.kinds.registry import KindFlags
 
 HEAD = """# All keys
 
@@ -46,6 +47,7 @@ SOURCES = dict.fromkeys(
     "threshold_source": "V2V's ablation with fixed thresholds",
     "noise_scales_with_threshold": _CODE,
     "frame_stride": _OURS,
+    "exposure_seconds": _OURS,
     "max_boxes": _OURS,
     "grids_per_frame": _OURS,
     "voxel_seconds": _OURS,
@@ -70,7 +72,7 @@ def page() -> str:
     """Return the whole page."""
     return "\n".join([
         HEAD,
-        *_section("Server", ServeConfig),
+        *_section("Server", ServeConfig, KindFlags),
         *_section("Stream", StreamSpec),
         "### Stream presets: `preset`\n",
         *_presets(STREAM_PRESETS),
@@ -81,9 +83,10 @@ def page() -> str:
     ])  # fmt: skip
 
 
-def _section(title: str, cls: type[Any]) -> Iterator[str]:
+def _section(title: str, *classes: type[Any]) -> Iterator[str]:
     yield f"## {title}\n"
-    shown = [(name, setting) for name, setting in settings_of(cls).items() if not setting.is_hidden]
+    settings = (row for each in classes for row in settings_of(each).items())
+    shown = [(name, setting) for name, setting in settings if not setting.is_hidden]
     for group, rows in groupby(shown, key=lambda row: row[1].group):
         if group != title:
             yield f"### {group}\n"

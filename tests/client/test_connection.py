@@ -20,10 +20,11 @@ import zmq.sugar.socket
 from tests.client.fake_server import SPEC, FakeServer
 from tests.waiting import until
 from v2v_client import V2VStreamDataset
-from v2v_client.connection import Connection, addresses, order
+from v2v_client.connection import Connection, order
 from v2v_client.conversation import Conversation, Event, WorkerShortage
 from v2v_client.options import Patience
-from v2v_protocol.errors import ServerLost, StateMismatch, UsageError
+from v2v_protocol.errors import NoWorkers, ServerLost, StateMismatch, UsageError
+from v2v_protocol.keys import addresses
 from v2v_protocol.link import dealer
 from v2v_protocol.messages import Frames, Hello
 from v2v_protocol.sample import DEFAULT_ARRAYS
@@ -307,12 +308,14 @@ def test_the_server_is_lost_once_each_broker_had_its_turn(unused_port: int) -> N
     assert ", ".join(brokers) in str(lost.value)
 
 
-def test_a_broker_without_workers_is_replaced_by_the_next(servers: tuple[FakeServer, FakeServer]) -> None:
+def test_a_broker_without_workers_is_not_left(servers: tuple[FakeServer, FakeServer]) -> None:
+    """The brokers share their workers, so the others have none either."""
     one, other = servers
     one.held, one.trouble = True, "no worker is connected"
     with closing(Connection([one.address, other.address], HELLO, 0, patience=PATIENT)) as connection:
         connection.open()
         connection.conversation._shortage = WorkerShortage(connection._now(), 0.0)  # no patience with one
         connection.want([0])
-        assert _next(connection) == 0
-        assert connection.address == other.address
+        with pytest.raises(NoWorkers, match="no worker is connected"):
+            _next(connection)
+    assert other.wants == []

@@ -330,7 +330,7 @@ def test_a_state_of_another_spec_seed_or_nothing_is_refused(server):
     with pytest.raises(StateMismatch, match="seed: the state has 5, this dataset 6"):
         dataset(server, seed=6).load_state_dict(state)
     for broken in ({}, {**state, "position": -1}, {**state, "extra": 1}, {**state, "version": 99}):
-        with pytest.raises(UsageError):
+        with pytest.raises(StateMismatch, match="not a state of V2VStreamDataset"):
             dataset(server).load_state_dict(broken)
 
 

@@ -24,7 +24,8 @@ from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import NoWorkers, ProtocolError
 from v2v_protocol.messages import Hello, Lease, Notes, Ping, Result, Want, WorkerHello, decode, encode
 from v2v_protocol.sample import array_layout
-from v2v_server.broker.state import ToConsumer, ToWorker
+from v2v_server.broker.state import Grant, ToConsumer, ToWorker
+from v2v_server.corpus.catalogue import complete_lease
 from v2v_server.worker.conversation import Leave, Make, Readiness, Send, WorkerConversation
 
 LAYOUT = array_layout(SMALL_SPEC.recipe, SMALL_SPEC.voxel_dtype, ("voxels",))
@@ -83,6 +84,9 @@ class Old:
             match todo.popleft():
                 case ToConsumer(_, frames):
                     self.consumer.hears(list(map(bytes, frames)))
+                case Grant() as grant:
+                    completed = complete_lease(grant.leases[0], self.at.catalogue, grant.spec)
+                    todo.extend(grant.messages(completed))
                 case ToWorker(_, frames) if self.worker.is_there:
                     for answer in self.worker.hears(with_fields(frames[0], **self.more)):
                         todo.extend(self.at.dispatcher.from_worker(b"w", answer, self.now))
@@ -107,13 +111,14 @@ def test_a_frozen_consumer_and_worker_are_served() -> None:
 def test_a_lease_has_notes_only_for_a_worker_that_has_some_itself(notes: Notes) -> None:
     """A release before them refuses them, and would pass over each of its leases."""
     at = peers()
-    complete = at.dispatcher.complete
-    at.dispatcher.complete = lambda lease, spec: replace(complete(lease, spec), notes=Notes(state=(1, 2)))
     at.dispatcher.from_consumer(b"c", encode(Hello(SMALL_SPEC.to_dict(), ("voxels",), 4, 0)), 0.0)
     at.dispatcher.from_consumer(b"c", encode(Want(0, [0])), 0.0)
     hello = WorkerHello("w", NUMERICS_VERSION, 2, "host", b"s" * 32, notes=notes)
     actions = at.dispatcher.from_worker(b"w", encode(hello), 0.0)
-    (lease,) = (decode(each.frames[0]) for each in actions if isinstance(each, ToWorker))
+    (grant,) = actions
+    assert isinstance(grant, Grant)
+    (sent,) = grant.messages(replace(grant.leases[0], notes=Notes(state=(1, 2))))
+    lease = decode(sent.frames[0])
     assert isinstance(lease, Lease)
     assert lease.notes == (Notes(state=(1, 2)) if notes != Notes() else Notes())
 
@@ -131,7 +136,7 @@ def test_a_worker_that_cannot_read_its_leases_leaves_and_the_consumer_is_told() 
     assert old.consumer.samples == []
     assert len(old.consumer.troubles) == 3
     assert all("cannot read a message: lease has no field rotation" in each for each in old.consumer.troubles)
-    assert old.at.dispatcher.counters.malformed == 0
+    assert old.at.broker.counters.malformed == 0
     old.more = {}  # the server is of an earlier release again
     old.joins()
     old.says(peer_8.write("ping"))
@@ -171,16 +176,16 @@ def said(actions: list[Any]) -> list[tuple[str, dict[str, Any]]]:
 
 def test_this_worker_works_for_a_frozen_server() -> None:
     hello = WorkerHello("w", NUMERICS_VERSION, 2, notes=Notes(memory_bytes=1 << 30))
-    talk = WorkerConversation(hello, "tcp://x:1", is_watched=False)
+    talk = WorkerConversation(hello, ("tcp://x:1",), is_watched=False)
     ((name, fields),) = said(talk.start(0.0))
     assert (name, fields["memory_bytes"]) == ("worker-hello", 1 << 30)
-    talk.on_messages([peer_8.write("lease", lease=7, indices=[3])], 0.0)
+    talk.on_messages([(0, peer_8.write("lease", lease=7, indices=[3]))], 0.0)
     *begun, make = talk.on_inspected(Readiness(True, True, False), 0.0)
     assert isinstance(make, Make)
     assert [name for name, _ in said(begun)] == ["begun"]
     talk.on_sample([b"header", b"array"], 0.0, Result(0))
     assert [(name, fields["lease"]) for name, fields in said(talk.on_messages([], 0.0))] == [("result", 7)]
-    *_, leave = talk.on_messages([peer_8.write("stop")], 0.0)
+    *_, leave = talk.on_messages([(0, peer_8.write("stop"))], 0.0)
     assert leave == Leave()
 
 
@@ -192,7 +197,7 @@ def test_the_reason_reaches_the_trainer_within_ten_seconds(caplog: pytest.LogCap
     talk = Conversation(
         "tcp://x:1", Hello({}, ("voxels",), 2, 7), 0, pinned=None, pinned_by="a test", patience=Patience(), now=0.0
     )
-    worker = WorkerConversation(WorkerHello("w", NUMERICS_VERSION, 2), "tcp://x:2", is_watched=False)
+    worker = WorkerConversation(WorkerHello("w", NUMERICS_VERSION, 2), ("tcp://x:2",), is_watched=False)
     now = 0.0
 
     def carry_out(actions: Any) -> None:
@@ -201,9 +206,11 @@ def test_the_reason_reaches_the_trainer_within_ten_seconds(caplog: pytest.LogCap
             match todo.popleft():
                 case ToConsumer(_, frames):
                     talk.handle_message(decode(bytes(frames[0])), list(map(bytes, frames[1:])), now)
-                case ToWorker(_, frames) if at.dispatcher.workers:  # it has not left
+                case Grant() as grant:
+                    todo.extend(grant.messages(complete_lease(grant.leases[0], at.catalogue, grant.spec)))
+                case ToWorker(_, frames) if at.broker.workers:  # it has not left
                     more = {"rotation": 90} if isinstance(decode(frames[0]), Lease) else {}
-                    answers = worker.on_messages([with_fields(frames[0], **more)], now)
+                    answers = worker.on_messages([(0, with_fields(frames[0], **more))], now)
                     for answer in answers:
                         if isinstance(answer, Send):
                             todo.extend(at.dispatcher.from_worker(b"w", answer.frames, now))

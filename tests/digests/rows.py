@@ -23,12 +23,15 @@ from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED, Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.kinds.photographs import PhotographKind
+from v2v_server.kinds.videos import VideoKind
 from v2v_server.prepare import prepare
 from v2v_server.schedule import Schedule, SequenceTable
 from v2v_server.store.cache import Cache, make_cache
-from v2v_server.store.pixels import VideosKind
 from v2v_server.video.rows import Rows
-from v2v_server.worker.produce import decode_for, make_sample, open_sidecars
+from v2v_server.worker.job import SampleJob
+from v2v_server.worker.making.make import make_sample
+from v2v_server.worker.making.read import decode_for, open_sidecars
 from v2v_tools.remake import lease_for
 
 ROWS = Rows.parse("0.05:0.95")
@@ -119,6 +122,13 @@ PORTABLE: Mapping[str, Row] = {
     "scene": Row({}, ("voxels", "frames", "frames_rgb", "boxes"), AUTO | {"still_share": 0.5}, count=6),
     "keep_defects": Row({}, spec=AUTO | {"keep_defects": "bars,cuts,duplicates"}, count=6),
     "worlds": Row("worlds", ("voxels", "frames", *_TRUTH), count=6),
+    "exposure_seconds": Row({"exposure_seconds": (0.2, 0.4)}, ("voxels", "frames", "frames_blurred"), count=6),
+    "exposure_seconds of photographs": Row(
+        {"preset": "worlds-fine", "exposure_seconds": (0.005, 0.05), "world_speed_px": (200.0, 600.0)},
+        ("voxels", "frames_blurred", *_TRUTH),
+        count=6,
+    ),
+    "worlds-fine": Row({"preset": "worlds-fine", "contrast_probability": 0.5}, ("voxels", "frames_u16"), count=6),
     "worlds with sub-steps": Row(
         FINE
         | {
@@ -212,7 +222,7 @@ class Ways:
             is_video = name != "photographs"
             if name not in ("videos", "photographs"):
                 self._prepare(name)
-            rows, kind = ROWS if name == "videos" else None, VideosKind() if is_video else VideosKind("photographs")
+            rows, kind = ROWS if name == "videos" else None, VideoKind() if is_video else PhotographKind()
             self._catalogues[name] = open_catalogue(
                 self.folder / name, rows=rows, cache_dir=self.folder, processes=0, scene=is_video, kind=kind
             )
@@ -263,10 +273,11 @@ def samples_of(catalogue: Catalogue, row: Row, cache: Cache | None = None) -> li
             Request(b"", row.epoch, index), sequence=sequence, catalogue=catalogue, spec=spec, seed=row.seed,
             arrays=row.arrays, siblings=siblings,
         )  # fmt: skip
-        all_decoded = decode_for(lease, lease.indices, catalogue.source, cache)
-        with open_sidecars(lease, catalogue.source) as sidecars:
+        job = SampleJob.of(lease)
+        all_decoded = decode_for(job.clip, lease.indices, catalogue.source, cache)
+        with open_sidecars(job.clip, catalogue.source) as sidecars:
             for which, decoded in zip(lease.indices, all_decoded, strict=True):
-                samples[which] = make_sample(replace(lease, indices=(which,)), decoded, sidecars=sidecars)
+                samples[which] = make_sample(replace(job, index=which), decoded, sidecars=sidecars)
     return [samples[index] for index in range(row.count)]
 
 

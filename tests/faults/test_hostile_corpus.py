@@ -16,6 +16,8 @@ import pytest
 
 from bench.processes import peak_rss_bytes
 from tests.clips import panned_luma, write_clip
+from tests.packed import pack
+from tests.server.corpus.test_archives import HOSTILE
 from tests.server.video.test_hostile import PLAYLISTS
 from tests.waiting import until
 from v2v_client import V2VStreamDataset
@@ -33,7 +35,9 @@ SMALL = {"voxels_per_clip": 4, "crop_height_px": 32, "crop_width_px": 40}
 
 @pytest.fixture
 def corpus(compiled: None, tmp_path: Path) -> Path:
-    """Good clips, playlists that name a file outside, a link to another, and clips with bytes changed or cut out."""
+    """Good clips, playlists that name a file outside, a link to another, clips with bytes changed or cut out; the same
+    in an archive, and archives that are damaged or lead out.
+    """
     folder, outside = tmp_path / "corpus", tmp_path / "outside"
     folder.mkdir()
     outside.mkdir()
@@ -59,6 +63,15 @@ def corpus(compiled: None, tmp_path: Path) -> Path:
             start = rng.randrange(len(content))
             del content[start : start + rng.randrange(2000)]
         (folder / f"fuzzed{number:02d}.{('mp4', 'mkv', 'avi')[number % 3]}").write_bytes(content)
+    (tmp_path / "packed").mkdir()
+    for path in [*folder.glob("good0.*"), *folder.glob("fuzzed0*")]:
+        shutil.copy(path, tmp_path / "packed")
+    for ending in ("tar", "zip"):
+        pack(tmp_path / "packed", folder / f"packed {ending}.{ending}")
+    (folder / "hostile").mkdir()
+    for number, (ending, write, _) in enumerate(HOSTILE.values()):
+        data = write(tmp_path / f"archive{ending}")
+        (folder / "hostile" / f"{number}{ending}").write_bytes(data)
     return folder
 
 
@@ -106,5 +119,12 @@ def test_a_hostile_folder_is_served_within_bounds(corpus: Path, tmp_path: Path) 
         assert re.search(rf"^  {re.escape(name)}: \S", said, re.MULTILINE), said
     opened = re.findall(r'open(?:at)?\([^"]*"([^"]+)"', log.read_text(errors="replace"))
     assert any(path.endswith("good0.mp4") for path in opened)  # the trace sees what is opened
+    packed = {item.video.partition("/")[0] for batch in samples for item in batch.provenance}
+    assert packed >= {"packed tar", "packed zip"}
+    main, *_ = trace = log.read_text(errors="replace").splitlines()
+    readers = {line.split()[0] for line in trace if "/hostile/" in line and re.search(r'\.(tar|zip)"', line)}
+    assert len(readers) > 0, "the trace sees who opens archives"
+    assert main.split()[0] not in readers, "the server's main process reads no table"
+    assert re.search(r"^  hostile/\d+\.tar: is cut short", said, re.MULTILINE), said
     assert not [path for path in opened if "outside/" in path]
     assert "root:x" not in said

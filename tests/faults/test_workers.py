@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ import psutil
 import pytest
 
 from tests.clips import panned_luma, write_clip
+from tests.packed import packed_forms
 from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of, server_workers
 from tests.waiting import has_ended, until
 from v2v_client import Batch, V2VStreamDataset
@@ -191,6 +193,28 @@ def test_a_poison_video_is_quarantined_and_stays_so(monkeypatch: pytest.MonkeyPa
         again = [batch for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch)]
         assert {worker.pid for worker in server_workers(server.pid)} == pids
     assert {item.quarantine for batch in again for item in batch.provenance} == {len(verdicts)}
+
+
+def test_a_member_of_an_archive_is_quarantined_as_the_file_is(
+    monkeypatch: pytest.MonkeyPatch, clips: Path, tmp_path: Path
+) -> None:
+    poison, found = "0/deep/c.mp4", {}
+    shutil.copytree(clips, tmp_path / "folder" / "0")
+    for form, folder in packed_forms(tmp_path / "folder", tmp_path).items():
+        cache = tmp_path / "cache" / form
+        fault = {"stage": "decode", "action": "SIGSEGV", "video": poison}
+        with _faulty(monkeypatch, folder, "--cache-dir", str(cache), **fault) as server:
+            served = [
+                item.video
+                for epoch in (0, 1)
+                for batch in epoch_of(server.address, epoch=epoch)
+                for item in batch.provenance
+            ]
+        assert poison not in served
+        (file,) = cache.glob("quarantine-*.jsonl")
+        found[form] = {(line.path, line.fingerprint, line.reason, line.spec) for line in read_quarantine(file).lines}
+    assert found["folder"] == found["tar"] == found["zip"]
+    assert {path for path, *_ in found["folder"]} == {poison}
 
 
 def test_memory_that_runs_out_is_no_verdict_on_a_video_for_other_specs(

@@ -17,7 +17,9 @@ from v2v_server.corpus.sources.folder import Folder
 from v2v_server.schedule import Schedule, SequenceTable
 from v2v_server.store.cache import Cache
 from v2v_server.video.rows import Rows
-from v2v_server.worker.produce import decode_for, make_sample
+from v2v_server.worker.job import SampleJob
+from v2v_server.worker.making.make import make_sample
+from v2v_server.worker.making.read import decode_for
 from v2v_tools.remake import lease_for
 
 
@@ -56,5 +58,6 @@ def open_leases(videos: Path, rows: str, spec: StreamSpec) -> Iterator[tuple[Pat
 
 def whole_sample(lease: Lease, root: Path, cache: Cache | None = None) -> Sample:
     """Make the sample of a lease as a server worker does: decode, or read from a cache; view, simulate."""
-    (decoded,) = decode_for(lease, lease.indices, Folder(root), cache)
-    return make_sample(lease, decoded)
+    job = SampleJob.of(lease)
+    (decoded,) = decode_for(job.clip, lease.indices, Folder(root), cache)
+    return make_sample(job, decoded)

@@ -1,14 +1,18 @@
 """Simulators of event cameras beside the product's own, as functions over recordings, and how alike two recordings are.
 
-The paper's equations are simulated event by event in float64. A peer is the published package of its authors: its
-source has to be importable.
+The equations of the paper and of ESIM are simulated event by event in float64. A peer is the published package of its
+authors: its source has to be importable. It runs on the processor, and its clock starts at the first frame.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import sys
 from collections.abc import Callable
+from functools import partial
 from importlib import import_module
+from importlib.util import find_spec, module_from_spec
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -20,8 +24,9 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec_flags import recipe_setting
 from v2v_recordings.items import Light
 from v2v_server.simulation.draw import draw
+from v2v_server.simulation.effects import NOISE
 from v2v_tools.fit.increments import BRIGHTEST_GREY, intervals_us
-from v2v_tools.fit.interval import Doubles, Estimate, bootstrap, sums_by_block, unknown
+from v2v_tools.fit.interval import SIDE, Doubles, Estimate, bootstrap, sums_by_block, unknown
 from v2v_tools.fit.recording import Recorded, recorded
 from v2v_tools.fit.regression import summit
 from v2v_tools.fit.statistics import INTERVAL_EDGES_US, simulate_recording
@@ -31,6 +36,20 @@ _WIDEST_OFFSET_SECONDS = 0.004
 _MOST_STEPS, _MOST_COUNT, _DARK = 32, 5, 0.03
 ROWS = 16
 """Peers get the pixels as pictures of this height: the number of pixels is a multiple of it."""
+GAPS = len(INTERVAL_EDGES_US) - 1
+SUMS = 4 * 6 + 4 + 2 * GAPS
+"""Six sums for each of four pairs of maps: pixels, both sums, both sums of squares, products. Then pixels of which the
+sensor's activity is missed, that it has active, whose activity is invented, that the simulation has active. Then
+intervals between events by their length, simulated and recorded.
+"""
+SIMULATED, RECORDED = [7, 13], [8, 14]
+"""Sums of the darker and of the brighter events, simulated and recorded."""
+FIGURES = (
+    "correlation", "darker", "brighter", "mirrored", "log_ratio", "ratio", "intervals", "missed", "invented"
+)  # fmt: skip
+"""Correlations of signed, darker and brighter events, and of signed events with the sensor's mirrored; |log ratio| of
+the numbers of events, its sign kept; distance of the distributions of intervals; shares of active pixels.
+"""
 Simulator = Callable[[Recorded, float, int], Recorded]
 """From a recording, a threshold (0: the camera's own) and a seed to its simulation."""
 
@@ -57,9 +76,12 @@ def part_of(recording: Recorded, chosen: npt.NDArray[np.bool_]) -> Recorded:
     )  # fmt: skip
 
 
-def of_recipe(name: str) -> Simulator:
-    """Return the product's own simulation of a recipe."""
+def of_recipe(name: str, *, noisy: bool = True) -> Simulator:
+    """Return the product's own simulation of a recipe, or of a recipe without its noise."""
     recipe = recipe_setting(name, [])
+    if not noisy:
+        quiet = ("noise_sigma", "hot_pixel_share", *NOISE)
+        recipe = recipe.replace(**dict.fromkeys(quiet, (0.0, 0.0)))
 
     def simulated(given: Recorded, threshold: float, seed: int) -> Recorded:
         mine = recipe.replace(threshold=(threshold,) * 2, threshold_ratio=(1.0, 1.0)) if threshold else recipe
@@ -79,16 +101,30 @@ def equations(given: Recorded, threshold: float, seed: int) -> Recorded:
     return of_events(given, events.seconds, events.pixel, events.polarity > 0)
 
 
-def v2e(given: Recorded, threshold: float, seed: int) -> Recorded:
-    """Simulate with v2e's EventEmulator; without a threshold its defaults."""
+def esim(given: Recorded, threshold: float, seed: int) -> Recorded:
+    """Simulate ESIM's equations with its authors' defaults: no noise, and a pixel starts as if it had just fired."""
+    positive = negative = threshold or 0.2
+    levels = np.log(1e-3 + given.known_light.of(given.frames))
+    events = dense_events(levels, given.frame_us.astype(np.float64), np.zeros(levels.shape[1]), positive, negative)
+    return of_events(given, events.seconds, events.pixel, events.polarity > 0)
+
+
+def v2e(given: Recorded, threshold: float, seed: int, params: str = "") -> Recorded:
+    """Simulate with v2e's EventEmulator; without a threshold its defaults, or the named set of its parameters."""
     emulator_class: Any = import_module("v2ecore.emulator").EventEmulator
     asked: dict[str, Any] = {"pos_thres": threshold, "neg_thres": threshold} if threshold else {}
-    emulator, found = emulator_class(seed=seed + 1, output_folder=None, **asked), []
-    for light, us in zip(given.known_light.of(given.frames), given.frame_us, strict=True):
+    emulator, found = emulator_class(seed=seed + 1, output_folder=None, device="cpu", **asked), []
+    if params:
+        emulator.set_dvs_params(params)
+        for name, value in asked.items():
+            setattr(emulator, name, value)
+    for light, us in zip(given.known_light.of(given.frames), _since_first(given), strict=True):
         made = emulator.generate_events(255.0 * light.reshape(ROWS, -1), us * 1e-6)
         found += [] if made is None else [np.asarray(made, np.float64)]
     t, x, y, p = np.concatenate(found).T if found else np.empty((4, 0))
-    return of_events(given, 1e6 * t, y * (len(given.pixels) // ROWS) + x, p > 0)
+    # The last events of a step have the time of its frame, with which the next step begins here.
+    us = given.frame_us[0] + np.maximum(1e6 * t - 1, 0)
+    return of_events(given, us, y * (len(given.pixels) // ROWS) + x, p > 0)
 
 
 def openeb(given: Recorded, threshold: float, seed: int) -> Recorded:
@@ -96,12 +132,27 @@ def openeb(given: Recorded, threshold: float, seed: int) -> Recorded:
     sample.
     """
     width, positive = len(given.pixels) // ROWS, threshold or 0.11
-    simulator_class: Any = import_module("metavision_core_ml.video_to_event.simulator").EventSimulator
+    simulator_class: Any = _openeb_module().EventSimulator
     made = simulator_class(ROWS, width, positive, threshold or 0.1, 1)
-    for light, us in zip(given.known_light.of(given.frames), given.frame_us, strict=True):
+    for light, us in zip(given.known_light.of(given.frames), _since_first(given), strict=True):
         made.image_callback(np.rint(255 * light.reshape(ROWS, width)).astype(np.uint8), int(us))
     events = made.get_events()
-    return of_events(given, events["t"], events["y"] * width + events["x"], events["p"] > 0)
+    return of_events(given, given.frame_us[0] + events["t"], events["y"] * width + events["x"], events["p"] > 0)
+
+
+def _openeb_module() -> Any:
+    """Import OpenEB's simulator without its compiled library, of which it takes the type of an event alone."""
+    package, library = "metavision_core_ml.video_to_event", "metavision_sdk_base"
+    found = find_spec(package)
+    if package not in sys.modules and found is not None:
+        sys.modules[package] = module_from_spec(found)  # not executed: its __init__ imports compiled libraries
+    if library not in sys.modules and find_spec(library) is None:
+        stand_in: Any = ModuleType(library)
+        stand_in.EventCD = np.dtype(
+            {"names": ["x", "y", "p", "t"], "formats": ["<u2", "<u2", "<i2", "<i8"], "offsets": [0, 2, 4, 8]}
+        )
+        sys.modules[library] = stand_in
+    return import_module(f"{package}.simulator")
 
 
 def eventcv(given: Recorded, threshold: float, seed: int) -> Recorded:
@@ -117,7 +168,37 @@ def eventcv(given: Recorded, threshold: float, seed: int) -> Recorded:
     return of_events(given, us, y * width + x, p > 0)
 
 
-PEERS: dict[str, Simulator] = {"v2e": v2e, "openeb": openeb, "eventcv": eventcv}
+def v2v(given: Recorded, threshold: float, seed: int) -> Recorded:
+    """Simulate with the code that the paper's authors released, which takes frames as gamma 2.2.
+
+    Cameras are drawn as its data set draws them. It counts events without times: they are spread evenly over a step.
+    """
+    emulator_class: Any = import_module("data.v2v_core_esim").EventEmulator
+    np.random.seed(seed)
+    random = np.random.default_rng(seed)
+    own = random.uniform(0.05, 2.0) * np.array([1.0, random.uniform(1.0, 1.5)])[:: random.choice((-1, 1))]
+    positive, negative = (threshold, threshold) if threshold else own
+    noise, hot_share, hot_sigma = random.uniform(0.0, [0.2, 0.001, 0.2])
+    video = 255.0 * given.known_light.of(given.frames).reshape(len(given.frames), ROWS, -1) ** (1 / 2.2)
+    made = emulator_class(positive, negative, noise, hot_share, hot_sigma).video_to_voxel(video)
+    counts = np.rint(made).astype(np.int64).reshape(len(made), -1)
+    step, pixel = np.nonzero(counts)
+    size = np.abs(counts[step, pixel])
+    first = np.repeat(np.cumsum(size) - size, size)
+    share = (np.arange(len(first)) - first + 0.5) / np.repeat(size, size)
+    at = np.repeat(step, size)
+    us = given.frame_us[at] + share * np.diff(given.frame_us)[at]
+    return of_events(given, us, np.repeat(pixel, size), np.repeat(counts[step, pixel] > 0, size))
+
+
+def _since_first(given: Recorded) -> npt.NDArray[np.int64]:
+    """Return the times of the frames from the first one on, us: [n]. Some peers refuse times before 0."""
+    return np.asarray(given.frame_us - given.frame_us[0])
+
+
+PEERS: dict[str, Simulator] = {
+    "v2e": v2e, "v2e-noisy": partial(v2e, params="noisy"), "openeb": openeb, "eventcv": eventcv, "v2v": v2v
+}  # fmt: skip
 
 
 def of_events(given: Recorded, t_us: Any, pixel: Any, p: Any) -> Recorded:
@@ -144,29 +225,53 @@ def correlation(one: Doubles, other: Doubles) -> float:
     return float(np.corrcoef(one, other)[0, 1]) if one.std() and other.std() else 0.0
 
 
-def compared(given: Recorded, true: Doubles, made: Recorded) -> dict[str, float]:
-    """Return the figures of one simulation."""
-    found, steps = counts_of(made), range(true.shape[1])
-    signed, real = found[1] - found[0], true[1] - true[0]
+def tallied(given: Recorded, true: Doubles, made: Recorded) -> Doubles:
+    """Return the sums that figures rest on, by block of the sensor and step: [SIDE**2, steps, :data:`SUMS`].
+
+    Args:
+        true: :func:`counts_of` the recording.
+    """
+    found, blocks = counts_of(made), given.blocks()
     row, column = np.divmod(given.pixels, given.width_px)
     place = row * given.width_px + given.width_px - 1 - column
     mirror = np.minimum(np.searchsorted(given.pixels, place), len(place) - 1)
     kept = given.pixels[mirror] == place
-    total, wanted = found.sum(axis=(0, 2)) + 0.5, true.sum(axis=(0, 2)) + 0.5
-    gaps = [np.histogram(intervals_us(each)[0], INTERVAL_EDGES_US)[0] for each in (made, given)]
-    shares = [each / max(each.sum(), 1) for each in gaps]
+    signed, real = found[1] - found[0], true[1] - true[0]
+    pairs = ((signed, real), (found[0], true[0]), (found[1], true[1]), (signed[:, mirror] * kept, real * kept))
+    columns = [
+        part for number, (one, other) in enumerate(pairs)
+        for part in (kept + 0.0 * one if number == 3 else np.ones_like(one), one, other, one**2, other**2, one * other)
+    ]  # fmt: skip
     active, seen_active = found.sum(axis=0) > 0, true.sum(axis=0) > 0
-    return {
-        "correlation": float(np.mean([correlation(signed[k], real[k]) for k in steps])),
-        **{name: float(np.mean([correlation(found[p][k], true[p][k]) for k in steps]))
-           for p, name in enumerate(("darker", "brighter"))},
-        "mirrored": float(np.mean([correlation(signed[k][mirror][kept], real[k][kept]) for k in steps])),
-        "log_ratio": float(np.abs(np.log(total / wanted)).mean()), "ratio": float(np.log(total / wanted).mean()),
-        "intervals": float(np.abs(shares[0] - shares[1]).sum() / 2),
-        "missed": float((seen_active & ~active).sum() / max(seen_active.sum(), 1)),
-        "invented": float((active & ~seen_active).sum() / max(active.sum(), 1)),
-        "events": float(total.sum()),
-    }  # fmt: skip
+    columns += [seen_active & ~active, seen_active, active & ~seen_active, active]
+    table = np.stack(columns, axis=2).astype(np.float64)
+    gaps = np.concatenate([_gaps_of(each, blocks, len(real)) for each in (made, given)], axis=2)
+    return np.concatenate([np.stack([sums_by_block(blocks, step) for step in table], axis=1), gaps], axis=2)
+
+
+def _gaps_of(given: Recorded, blocks: npt.NDArray[np.int64], steps: int) -> Doubles:
+    """Return how many intervals end in each step, by their length: [SIDE**2, steps, GAPS]."""
+    owner = np.repeat(np.arange(len(given.pixels)), np.diff(given.first))
+    ends = np.flatnonzero(np.diff(owner) == 0) + 1
+    step = np.searchsorted(given.frame_us, given.t_us[ends], side="right") - 1
+    length = np.searchsorted(INTERVAL_EDGES_US, intervals_us(given)[0], side="right") - 1
+    inside = (step >= 0) & (step < steps)
+    place = ((blocks[owner[ends]] * steps + step) * GAPS + length)[inside]
+    return np.bincount(place, minlength=SIDE**2 * steps * GAPS).reshape(SIDE**2, steps, GAPS).astype(np.float64)
+
+
+def figures(sums: Doubles) -> Doubles:
+    """Return the figures of one simulation from its sums: [..., SUMS] to [..., FIGURES], in the order of FIGURES."""
+    count, one, other, ones, others, both = np.moveaxis(sums[..., :24].reshape(*sums.shape[:-1], 4, 6), -1, 0)
+    spread = (count * ones - one**2) * (count * others - other**2)
+    alike = np.where(spread > 1e-9, (count * both - one * other) / np.sqrt(np.maximum(spread, 1e-9)), 0.0)
+    missed, seen, invented, active = np.moveaxis(sums[..., 24:28], -1, 0)
+    ratio = np.log((one[..., 1] + one[..., 2] + 0.5) / (other[..., 1] + other[..., 2] + 0.5))
+    gaps = sums[..., 28:].reshape(*sums.shape[:-1], 2, GAPS)
+    shares = gaps / np.maximum(gaps.sum(axis=-1, keepdims=True), 1.0)
+    apart = np.abs(shares[..., 0, :] - shares[..., 1, :]).sum(axis=-1) / 2
+    rest = (np.abs(ratio), ratio, apart, missed / np.maximum(seen, 1.0), invented / np.maximum(active, 1.0))
+    return np.concatenate([alike, np.stack(rest, axis=-1)], axis=-1)
 
 
 def within(given: Recorded) -> Recorded:

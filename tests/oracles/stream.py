@@ -24,7 +24,9 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.schedule import MOST_CANDIDATES, Schedule, SequenceTable, VideoSequence
-from v2v_server.worker.produce import decode_for, make_sample, open_sidecars
+from v2v_server.worker.job import SampleJob
+from v2v_server.worker.making.make import make_sample
+from v2v_server.worker.making.read import decode_for, open_sidecars
 from v2v_tools.remake import lease_for, remake
 
 
@@ -109,9 +111,9 @@ class StreamOracle:
             seed=self._asked.seed,
             arrays=self._asked.arrays,
         )
-        source = self._catalogue.source
-        with open_sidecars(lease, source) as sidecars:
-            made = make_sample(lease, decode_for(lease, lease.indices, source)[0], sidecars=sidecars)
+        job, source = SampleJob.of(lease), self._catalogue.source
+        with open_sidecars(job.clip, source) as sidecars:
+            made = make_sample(job, decode_for(job.clip, lease.indices, source)[0], sidecars=sidecars)
         return sighting(made.arrays, made.provenance)
 
 

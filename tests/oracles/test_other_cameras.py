@@ -51,6 +51,31 @@ def test_a_steady_ramp_fires_by_threshold_and_refractory_period(ignores: bool) -
     assert (gaps_of(made, side) < 0.9e6 * period).any() == ignores
 
 
+@pytest.mark.parametrize(
+    ("share", "hz", "rate", "opposite"),
+    [
+        (0.22, 35.0, 1.73, 0.968),
+        pytest.param(0.26, 10.0, 1.98, None, marks=pytest.mark.slow),
+        pytest.param(0.24, 20.0, 2.19, None, marks=pytest.mark.slow),
+    ],
+)
+def test_noise_before_the_comparator_has_the_rate_and_the_signs_of_fine_steps(
+    share: float, hz: float, rate: float, opposite: float | None
+) -> None:
+    """Rates are those of steps of 50 us with the chance of a crossing between them, from .3 s on, mismatch .14."""
+    side, seconds = 32, 2
+    film = Film(np.full((240 * seconds + 1, side, side), 0.5, np.float32), 240)
+    made = record(film, TrueCamera(0.2, 0.2, 0.14, band_share=share, band_hz=hz), 3)
+    late = made["t"] > 300_000
+    # Counts of a pixel spread by six times their mean.
+    expected = rate * side**2 * (seconds - 0.3)
+    assert abs(late.sum() - expected) < 0.12 * expected + 2 * math.sqrt(6 * expected)
+    place = (made["y"] * side + made["x"])[late]
+    order = np.argsort(place, kind="stable")
+    turns = np.diff(made["p"][late][order].astype(int))[np.diff(place[order]) == 0] != 0
+    assert turns.mean() > (opposite or 0.94) - 0.02
+
+
 def gaps_of(made: Mapping[str, Any], width: int) -> npt.NDArray[np.int64]:
     """Return the intervals between events of a pixel, us."""
     place = made["y"] * width + made["x"]

@@ -1,9 +1,5 @@
 """Pictures and truth of a world by its definition, point by point in float64: ``v2v_server/worlds`` written again with
 numpy's and scipy's own functions, without homographies and without its kernels.
-
-    python -m tests.oracles.worlds
-
-prints how far the events of a moving pattern are from its exact crossings.
 """
 
 from __future__ import annotations
@@ -18,11 +14,13 @@ from scipy.interpolate import BSpline  # type: ignore[import-untyped]
 
 from tests.oracles.rendered import GAMMA, LOG_EPS, START_LOG_UNITS, Counts, Errors, counts_of, errors, log_levels
 from v2v_protocol.recipe import PRESETS
-from v2v_protocol.spec import MOST_SUBSTEPS
+from v2v_protocol.spec import StreamSpec
 from v2v_server.simulation import simulate
 from v2v_server.simulation.draw import draw
 from v2v_server.simulation.kernels import fill
-from v2v_server.worlds.render import levels_between, pyramid_of, render
+from v2v_server.video.decode import SampleView
+from v2v_server.worlds.clip import render_clip
+from v2v_server.worlds.render import pyramid_of
 from v2v_server.worlds.world import World, draw_world
 
 Reals = npt.NDArray[np.float64]
@@ -34,17 +32,19 @@ class Oracle:
     Args:
         world: the draw.
         grey: [H, W] uint8 or uint16.
+        is_rounded: whether its light has whole levels of 12 bits; else that of its own.
     """
 
-    def __init__(self, world: World, grey: npt.NDArray[np.unsignedinteger]) -> None:
+    def __init__(self, world: World, grey: npt.NDArray[np.unsignedinteger], *, is_rounded: bool = True) -> None:
         self.world, self.size = world, grey.shape[::-1]
         self._pose = cache(self._pose_at)
-        self.levels = [np.floor(grey * (4095 / np.iinfo(grey.dtype).max) + 0.5)]
+        light = grey * (4095 / np.iinfo(grey.dtype).max)
+        self.levels = [np.floor(light + 0.5) if is_rounded else light]
         while min(self.levels[-1].shape) > 2:
             level = np.pad(self.levels[-1], [(0, side % 2) for side in self.levels[-1].shape], "edge")
             height, width = level.shape
             means = level.reshape(height // 2, 2, width // 2, 2).mean(axis=(1, 3))
-            self.levels.append(np.floor(means + 0.5))
+            self.levels.append(np.floor(means + 0.5) if is_rounded else means)
 
     def grid(self) -> Reals:
         """Return the middles of the crop's pixels, [2, H, W] in px of the picture, from left to right as the view sees
@@ -174,64 +174,66 @@ def _way(moved: float, reach: float, start: float) -> float:
     return quarter * (place((moved + start) / quarter) - place(start / quarter))
 
 
-def event_errors(
-    grey: tuple[float, float], period_px: float, speed_px: float, threshold: float, hz: float, substep_px: float
-) -> Errors:
-    """Return how far the events of each frame step of a moving pattern are from its exact crossings.
+def waves(grey: tuple[float, float], period_px: float, size: int = 240) -> npt.NDArray[np.uint16]:
+    """Return a photograph, [size, size], of two crossed sines between two grey levels of 0 .. 255."""
+    y, x = np.mgrid[:size, :size] + 0.5
+    sines = np.sin(2 * np.pi * x / period_px) + np.sin(2 * np.pi * y / period_px + 1.0)
+    light = (grey[0] + grey[1]) / 2 + (grey[1] - grey[0]) / 4 * sines
+    levels: npt.NDArray[np.uint16] = np.floor(light * (65535 / 255) + 0.5).astype(np.uint16)
+    return levels
 
-    The pattern is the photograph's, bilinear between its pixels: its light is known at any time, to 53 bits.
+
+def event_counts(
+    photograph: npt.NDArray[np.unsignedinteger],
+    spec: StreamSpec,
+    px_per_frame: float,
+    threshold: float,
+    index: int = 0,
+    side: int = 24,
+    steps: int = 8,
+    moments: int = 64,
+) -> tuple[Counts, Counts]:
+    """Return the events of each frame step of a photograph that passes, and the exact crossings of its light.
+
+    The light is the photograph, bilinear between its pixels, in float64.
 
     Args:
-        grey: darkest and brightest level of the pattern, two crossed sines.
-        period_px: of them.
-        speed_px: px a second.
+        photograph: [H, W].
+        spec: its fields of a world say how light is rendered; all else is fixed.
+        px_per_frame: speed, in a direction that the index draws.
         threshold: of both polarities.
-        hz: frames a second.
-        substep_px: 0 for none.
+        index: of the sample.
+        side: of the crop, px.
+        steps: between frames, at 60 Hz.
+        moments: of a step, at which the light is known.
     """
-    size, steps = 240, 8
-
-    y, x = np.mgrid[:size, :size] + 0.5
-    waves = np.sin(2 * np.pi * x / period_px) + np.sin(2 * np.pi * y / period_px + 1.0)
-    light = (grey[0] + grey[1]) / 2 + (grey[1] - grey[0]) / 4 * waves
-    photograph = np.floor(light * (65535 / 255) + 0.5).astype(np.uint16)
-    recipe = PRESETS["noise-free"].replace(crop_height_px=24, crop_width_px=24, world_speed_px=speed_px)
-    params = draw(recipe, seed=1, epoch=0, index=0, picture_height_px=size, picture_width_px=size, video_id="")
-    params = dataclasses.replace(params, flip=False)
-    seconds = np.arange(steps + 1) / hz
-    world = draw_world(
-        recipe, params, seed=1, epoch=0, index=0, picture_px=(size, size), seconds=(0.0, float(seconds[-1]))
-    )
-    pyramid = pyramid_of(photograph)
+    height, width = photograph.shape
+    fine = {name: getattr(spec.recipe, name) for name in ("world_bits", "world_change_share")}
+    recipe = PRESETS["noise-free"].replace(
+        **fine, crop_height_px=side, crop_width_px=side, world_speed_px=60.0 * px_per_frame, voxels_per_clip=steps,
+        bins=1, threshold=threshold, threshold_ratio=1.0, gamma=GAMMA, log_eps=LOG_EPS,
+    )  # fmt: skip
+    params = draw(recipe, seed=1, epoch=0, index=index, picture_height_px=height, picture_width_px=width, video_id="")
+    seconds, pyramid = np.arange(steps + 1) / 60.0, pyramid_of(photograph, recipe.world_bits)
+    view = SampleView(dataclasses.replace(spec, recipe=recipe), params, ())
+    clip = render_clip(pyramid, (height, width), seconds, (1, 0, index), view)
     made = simulate(
-        render(pyramid, world, seconds), threshold_pos=threshold, bins=1, gamma=GAMMA, log_eps=LOG_EPS, bits=12,
+        clip.frames, threshold_pos=threshold, bins=1, gamma=GAMMA, log_eps=LOG_EPS, bits=clip.signal.bits,
         start_residual=START_LOG_UNITS,
     )  # fmt: skip
-    given = made.given
-    if substep_px:
-        between = levels_between(pyramid, world, seconds, np.arange(steps + 1), substep_px, MOST_SUBSTEPS)
-        given = dataclasses.replace(given, levels=between)
+    given = dataclasses.replace(made.given, levels=clip.levels)
     counts = fill(given, made.real, {"event_counts": None})[0]["event_counts"].reshape(steps, 2, -1).astype(np.int64)
-    oracle = Oracle(world, photograph)
-    times = np.linspace(0.0, seconds[-1], steps * 64 + 1)
+    world = draw_world(
+        recipe, params, seed=1, epoch=0, index=index, picture_px=(height, width), seconds=(0.0, float(seconds[-1]))
+    )
+    oracle = Oracle(world, photograph, is_rounded=False)
+    times = np.linspace(0.0, seconds[-1], steps * moments + 1)
     levels = np.stack([log_levels(oracle.picture(time) / 4095).ravel() for time in times.tolist()])
-    return errors(Counts(counts[:, 1], counts[:, 0]), counts_of(levels, times, seconds, threshold))
+    return Counts(counts[:, 1], counts[:, 0]), counts_of(levels, times, seconds, threshold)
 
 
-def main() -> None:
-    """Print the table."""
-    print("| grey | period px | px a frame | c | signed | count | signed with sub-steps of 1 px | count |")
-    print("|---|---|---|---|---|---|---|---|")
-    for grey in ((40.0, 250.0), (2.0, 60.0)):
-        for period in (8.0, 32.0, 100.0):
-            for speed in (0.5, 2.0, 8.0):
-                for threshold in (0.1, 0.3):
-                    found = [event_errors(grey, period, 60 * speed, threshold, 60.0, substep) for substep in (0.0, 1.0)]
-                    figures = " | ".join(f"{each.signed:.1%} | {each.count:+.1%}" for each in found)
-                    print(
-                        f"| {grey[0]:g} to {grey[1]:g} | {period:g} | {speed:g} | {threshold} | {figures} |", flush=True
-                    )
-
-
-if __name__ == "__main__":
-    main()
+def event_errors(
+    photograph: npt.NDArray[np.unsignedinteger], spec: StreamSpec, px_per_frame: float, threshold: float
+) -> Errors:
+    """Return how far events are from the exact crossings, see :func:`event_counts`."""
+    return errors(*event_counts(photograph, spec, px_per_frame, threshold))

@@ -25,7 +25,6 @@ from v2v_protocol.sample import Provenance, SampleId, SampleParams
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.sources.prepared import Header
 from v2v_server.store.format import PACK_METHODS, Head
-from v2v_server.store.pixels import VideosKind
 
 ROOT = Path(__file__).parents[2]
 FOUND = [
@@ -47,7 +46,6 @@ EXAMPLES: dict[type[Any], Any] = {
     Recipe: Recipe(),
     StreamSpec: StreamSpec(),
     ResumeState: ResumeState(STREAM, 3, 1, 0, 40, 2, None, 7),
-    VideosKind: VideosKind(),
 }
 """Classes whose fields also have to fit each other."""
 OF_OTHER_FORM = (Recipe, StreamSpec, ResumeState, Notes)

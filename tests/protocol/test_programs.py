@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import runpy
+import shlex
 import signal
 import subprocess
 import sys
 import tomllib
+from importlib.metadata import PackageNotFoundError, PathDistribution
 from pathlib import Path
+from typing import Any
 
 import pytest
+from packaging.requirements import Requirement
 
 from v2v_protocol import programs
 from v2v_protocol.command import Parser, run_command
@@ -64,7 +69,57 @@ def test_a_missing_package_is_named(
     assert programs.convert() == 2
     line = capsys.readouterr().err
     assert line.startswith(f"v2v-convert: needs the Python package {said}, ")
-    assert "pip install '.[convert]'" in line
+    assert line.endswith(f": {programs.install_line('convert')}\n")
+
+
+CHECKOUT = {"url": "file:///home/a%20b/v2v-stream", "dir_info": {"editable": True}}
+COPY = {"url": "file:///home/v2v-stream", "dir_info": {}}
+WHEEL = {"url": "file:///tmp/v2v_stream-1.0.0-py3-none-any.whl", "archive_info": {}}
+REPOSITORY = {"url": "https://a.example/v2v-stream.git", "vcs_info": {"vcs": "git", "commit_id": "0" * 40}}
+
+
+@pytest.mark.parametrize(
+    ("origin", "said"),
+    [
+        (None, "v2v-stream[trainer]"),
+        (CHECKOUT, "/home/a b/v2v-stream[trainer]"),
+        (COPY, "v2v-stream[trainer] @ file:///home/v2v-stream"),
+        (WHEEL, "v2v-stream[trainer] @ file:///tmp/v2v_stream-1.0.0-py3-none-any.whl"),
+        (REPOSITORY, "v2v-stream[trainer] @ git+https://a.example/v2v-stream.git"),
+    ],
+)
+def test_an_extra_is_installed_from_where_the_rest_came(
+    origin: dict[str, Any] | None, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if origin:
+        (tmp_path / "direct_url.json").write_text(json.dumps(origin), encoding="utf-8")
+    monkeypatch.setattr("importlib.metadata.distribution", lambda name: PathDistribution(tmp_path))
+    words = shlex.split(programs.install_line("trainer"))
+    assert words[:2] == ["pip", "install"]
+    assert words[-1] == said
+    assert ("--editable" in words) == (origin is CHECKOUT)
+    if origin is not CHECKOUT:
+        assert Requirement(said).extras == {"trainer"}
+
+
+def test_a_reader_that_leaves_ends_a_program_without_a_traceback() -> None:
+    many = "import v2v_protocol.programs as p\nfor line in range(100_000): p.show(str(line))"
+    child = subprocess.Popen([sys.executable, "-c", many], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert child.stdout
+    assert child.stdout.readline() == b"0\n"
+    child.stdout.close()
+    assert child.stderr
+    with child.stderr as said:
+        assert said.read() == b""
+    assert child.wait() == 128 + signal.SIGPIPE
+
+
+def test_a_tree_that_is_not_installed_names_the_index(monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent(name: str) -> None:
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr("importlib.metadata.distribution", absent)
+    assert programs.install_line("server,cloud") == "pip install 'v2v-stream[server,cloud]'"
 
 
 WITHOUT = """
@@ -89,7 +144,7 @@ def test_the_client_without_its_packages_names_the_extra(package: str) -> None:
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1] == (
         f"ModuleNotFoundError: v2v_client needs the Python package {package}, which is not installed; the extra "
-        "'client' brings it: pip install '.[client]' in a checkout of v2v-stream"
+        f"'client' brings it: {programs.install_line('client')}"
     )
 
 

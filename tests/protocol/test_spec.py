@@ -43,6 +43,9 @@ OTHER_RECIPE_VALUES: dict[str, Any] = {
     "world_still_share": 0.1,
     "world_turn_only_share": 0.1,
     "world_plain_share": 0.1,
+    "exposure_seconds": (0.001, 0.01),
+    "world_bits": 16,
+    "world_change_share": 0.5,
     "track_points": 32,
     "contrast_probability": 0.1,
     "contrast_scale": [1.0, 2.0],
@@ -99,6 +102,7 @@ PRESET_DIGESTS = {
     "davis346": "c52d5b5342fc135b5676b3a5116ece57",
     "davis346-running": "1de5b42d34b14b580736c38330ca12b3",
     "worlds": "71b398f70f04d63139ff2eb79b61849d",
+    "worlds-fine": "b426778d302c145883f2b6cdfb1f9d22",
 }
 """No preset changes its meaning: new behaviour gets a new name."""
 
@@ -128,6 +132,8 @@ def test_more_events_than_can_be_counted_are_refused() -> None:
     assert StreamSpec(extreme).substep_px == 0.0
     with pytest.raises(UsageError, match=r"substep_px = 1: a pixel may fire .* raise the recipe's smallest threshold"):
         StreamSpec(extreme, substep_px=1.0)
+    with pytest.raises(UsageError, match=r"world_change_share = 0.5: .* or set world_change_share to 0"):
+        StreamSpec(extreme.replace(world_change_share=0.5))
 
 
 def test_every_field_is_covered() -> None:

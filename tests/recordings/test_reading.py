@@ -26,7 +26,7 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList
 from v2v_recordings.items import ConvertOptions, EventChunk, Item, Note, Picture, SensorSize
 from v2v_recordings.reading import LATE_NS, _Clock, read_items, recognise
-from v2v_tools.event_files import EVENT_WRITERS, write_events
+from v2v_recordings.writers import ENDINGS, write_events
 from v2v_tools.fit.recording import read_recording
 
 
@@ -51,7 +51,7 @@ def listed(events: int = 500) -> EventList:
 
 
 @pytest.mark.parametrize("capitals", [False, True])
-@pytest.mark.parametrize("ending", EVENT_WRITERS)
+@pytest.mark.parametrize("ending", ENDINGS)
 def test_own_exports_are_read_back(tmp_path: Path, ending: str, capitals: bool) -> None:
     path, events = tmp_path / f"ev{ending.upper() if capitals else ending}", listed()
     write_events(path, events)

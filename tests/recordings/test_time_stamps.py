@@ -31,9 +31,15 @@ def test_the_unit_of_whole_numbers_follows_from_the_rate(first: int, step: int, 
     ns, names, remark = read_times(text(list(times)))
     assert ns.tolist() == [time * NS[unit] for time in times], "exact"
     assert not len(names)
-    assert remark == (
-        "" if unit == "s" else f"its times are taken for {unit}, {1e9 / step / NS[unit]:.4g} pictures a second"
-    )
+    if step == 1:
+        assert remark.startswith(
+            f"its numbers, {first}, {first + 1} ..., count the pictures one by one and are taken for"
+        )
+        assert "remove the file and state the rate with --rate" in remark
+        assert read_times(text(list(times), heading="# seconds\n"))[2] == ""
+    else:
+        guessed = f"its times are taken for {unit}, {1e9 / step / NS[unit]:.4g} pictures a second"
+        assert remark == ("" if unit == "s" else guessed)
 
 
 @pytest.mark.parametrize(("step", "unit"), [(0.04, "s"), (1.0, "s"), (33.366, "ms"), (35714.28, "us"), (1e-4, "s")])

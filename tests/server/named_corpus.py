@@ -17,8 +17,8 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue, CorpusPart
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.corpus.videos import CorpusFacts, Sidecars, VideoEntry, unknown_arrays
-from v2v_server.store.pixels import kind_of
+from v2v_server.corpus.videos import CorpusFacts, Sidecars, VideoEntry
+from v2v_server.kinds.registry import kind_of
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
 
@@ -52,7 +52,7 @@ class NamedCorpus:
     @property
     def facts(self) -> CorpusFacts:
         """What is known in memory; these videos have no statistics."""
-        missing = unknown_arrays(kind_of(self.videos[0].id))
+        missing = kind_of(self.videos[0].id).cannot()
         return CorpusFacts(self.videos, self.rows, self.digest, None, self.sidecars, missing)
 
     def part(self) -> CorpusPart:

@@ -12,6 +12,7 @@ from typing import Any
 from tests.server.named_corpus import SMALL_SPEC, corpus, video
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.arena import NO_SLOT
+from v2v_protocol.errors import IndexUnreadable, V2VError
 from v2v_protocol.messages import (
     Begun,
     Buffer,
@@ -38,8 +39,10 @@ from v2v_server.broker.leases import Cause, Loss
 from v2v_server.broker.state import (
     Action,
     AddToQuarantine,
+    Broker,
     CheckVideo,
     GiveUp,
+    Grant,
     ReportRefusal,
     ToConsumer,
     ToWorker,
@@ -143,6 +146,10 @@ class Peers:
     passed_over: list[Refusal] = field(default_factory=list)
     sent: list[tuple[str, Any]] = field(default_factory=list)
 
+    @property
+    def broker(self) -> Broker:
+        return self.dispatcher.broker
+
     # --- carrying -----------------------------------------------------------------------------------------------------
 
     def carry_out(self, actions: list[Action]) -> None:
@@ -160,10 +167,19 @@ class Peers:
                     self.sent.append(("to worker", message))
                     if isinstance(message, Lease):
                         self.leases.setdefault(identity, deque()).append(message)
-                        asked = self.dispatcher.leases.request(message.lease, identity)
+                        asked = self.broker.leases.request(message.lease, identity)
                         self.owners[message.lease] = b"" if asked is None else asked.session
                     else:
                         self.told.setdefault(identity, []).append(message)
+                case Grant() as grant:
+                    try:
+                        todo.extend(grant.messages(complete_lease(grant.leases[0], self.catalogue, grant.spec)))
+                    except IndexUnreadable as error:  # none of the others can be completed either
+                        grants = [grant, *(each for each in todo if isinstance(each, Grant))]
+                        todo = deque(each for each in todo if not isinstance(each, Grant))
+                        todo.extend(self.dispatcher.not_granted(grants, error, self.now))
+                    except V2VError as error:
+                        todo.extend(self.dispatcher.not_granted([grant], error, self.now))
                 case GiveUp(identity, reason):
                     self.given_up.append(identity)
                     cause = Cause.UNEXPLAINED if identity in self.remote else Cause.HUNG
@@ -300,10 +316,9 @@ def peers(
     """Return a dispatcher over a small corpus, or over the given one, without connected peers."""
     videos = catalogue or corpus(*(video(f"v{number}.mp4") for number in range(5)))
     held = Quarantine() if quarantine is None else quarantine
-    dispatcher = Dispatcher(
+    broker = Broker(
         videos.facts,
         spec,
-        complete=lambda lease, spec: complete_lease(lease, videos, spec),
         lease_deadline_seconds=DEADLINE,
         session_idle_seconds=IDLE,
         max_credit_bytes=max_credit_bytes,
@@ -312,7 +327,7 @@ def peers(
         expected_workers=expected_workers,
         share_bytes=share_bytes,
     )
-    return Peers(dispatcher, videos, held)
+    return Peers(Dispatcher(broker), videos, held)
 
 
 def serving(*indices: int, worker: bytes = b"w", credit: int = CREDIT, **hello: Any) -> Peers:

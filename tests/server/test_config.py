@@ -365,13 +365,14 @@ def test_the_workers_that_a_credit_is_settled_for(
     class Stopped(Exception):
         pass
 
-    def dispatcher(*given: Any, expected_workers: int, **settings: Any) -> None:
+    def broker(*given: Any, expected_workers: int, **settings: Any) -> None:
         raise Stopped(expected_workers)
 
     for what_changes_this_process in ("keep_freed_memory", "open_many_files"):
         monkeypatch.setattr(f"v2v_server.serve.{what_changes_this_process}", lambda: None)
     monkeypatch.setattr("v2v_server.serve.load_catalogue", lambda config: corpus(video("a.mp4")))
-    monkeypatch.setattr("v2v_server.serve.Dispatcher", dispatcher)
+    monkeypatch.setattr("v2v_server.serve.Broker", broker)
+    monkeypatch.setattr("v2v_server.serve.notes_of", lambda catalogue: [])  # these videos are no columns
     small = ["voxels_per_clip=1", "crop_height_px=8", "crop_width_px=8"]
     with pytest.raises(Stopped, match=f"^{expected}$"):
         serve(load(tmp_path, None, small, videos="a", bind="tcp://127.0.0.1:*", **workers))

@@ -36,8 +36,8 @@ from v2v_protocol.messages import (
 )
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Cause
+from v2v_server.broker.state import Broker
 from v2v_server.config import ServeConfig
-from v2v_server.corpus.catalogue import complete_lease
 from v2v_server.quarantine import read_quarantine
 from v2v_server.serve import Server
 from v2v_server.worker.conversation import (
@@ -108,7 +108,7 @@ class Worker:
         self.name, self.world = name, world
         self.kernels = False
         hello = WorkerHello(name.decode(), NUMERICS_VERSION, CREDIT)
-        self.conversation = WorkerConversation(hello, "queue://workers", is_watched=True)
+        self.conversation = WorkerConversation(hello, ("queue://workers",), is_watched=True)
         self.step: WorkerAction = Leave()
         world.queues.connect(name)
         self._take(self.conversation.start(world.now))
@@ -126,7 +126,7 @@ class Worker:
         match self.step:
             case Listen():
                 inbox = self.world.queues.sent[self.name]
-                messages = [frames[0] for frames in inbox]
+                messages = [(0, frames[0]) for frames in inbox]
                 inbox.clear()
                 self._take(self.conversation.on_messages(messages, self.world.now))
             case Inspect(lease):
@@ -165,16 +165,16 @@ class World:
         videos = corpus(*(video(f"v{number}.mp4") for number in range(5)))
         file = self.folder / "quarantine.jsonl"
         quarantine = read_quarantine(file)
-        self.dispatcher = Dispatcher(
+        broker = Broker(
             videos.facts,
             SMALL_SPEC,
-            complete=lambda lease, spec: complete_lease(lease, videos, spec),
             lease_deadline_seconds=DEADLINE,
             session_idle_seconds=600.0,
             max_credit_bytes=2 << 30,
             quarantine=quarantine,
             wall_clock=lambda: "2024-02-29T12:00:00+00:00",
         )
+        self.dispatcher = Dispatcher(broker)
         self.supervisor = ToyPool(lambda name, address: self._begin(name))
         self.supervisor.workers = list(self.workers)  # they find the new server at the same address
         self.server = Server(
@@ -283,10 +283,10 @@ class AnyOrder(RuleBasedStateMachine):
     def time_passes(self, seconds: float) -> None:
         self.world.now += seconds
 
-    @precondition(lambda self: self.world.dispatcher.counters.samples)
+    @precondition(lambda self: self.world.dispatcher.broker.counters.samples)
     @rule()
     def server_restarts(self) -> None:
-        assert self.world.dispatcher.counters.malformed == 0
+        assert self.world.dispatcher.broker.counters.malformed == 0
         self.world.start()
 
     def teardown(self) -> None:
@@ -297,8 +297,8 @@ class AnyOrder(RuleBasedStateMachine):
         self.world.settle()
         for consumer in self.world.consumers.values():
             assert all(times == 1 for times in consumer.samples.values())
-        assert self.world.dispatcher.waiting == 0
-        assert self.world.dispatcher.counters.malformed == 0  # nothing that a conversation says is nonsense
+        assert self.world.dispatcher.broker.waiting == 0
+        assert self.world.dispatcher.broker.counters.malformed == 0  # nothing that a conversation says is nonsense
         shutil.rmtree(self.folder)
 
 
@@ -331,7 +331,7 @@ def walk(seed: int) -> Counter[str]:
         if name == "restart":
             at_work = any(isinstance(worker.step, Make) for worker in model.world.workers.values())
             seen["restarted while samples are made"] += at_work
-            counters = model.world.dispatcher.counters
+            counters = model.world.dispatcher.broker.counters
             seen["refused"] += counters.refused_candidates
             seen["lost"] += counters.workers_lost
         moves[name][1]()

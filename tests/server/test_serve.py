@@ -11,12 +11,14 @@ from typing import Any, cast
 
 import pytest
 
+from tests.server.named_corpus import SMALL_SPEC
 from tests.server.peers import peers
 from tests.server.queues import Queues, ToyPool
 from v2v_protocol import NUMERICS_VERSION
-from v2v_protocol.errors import VideoChanged
-from v2v_protocol.messages import Pong, Stop, WorkerHello, encode
+from v2v_protocol.errors import IndexUnreadable, ProtocolError, V2VError, VideoChanged
+from v2v_protocol.messages import Lease, Pong, Stop, WorkerHello, encode
 from v2v_protocol.sample import Refusal
+from v2v_protocol.spec import StreamSpec
 from v2v_server import serve as serve_module
 from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Cause, Loss, Request
@@ -26,6 +28,7 @@ from v2v_server.broker.state import (
     CheckVideo,
     Counters,
     GiveUp,
+    Grant,
     ReportRefusal,
     ToConsumer,
     ToWorker,
@@ -43,7 +46,8 @@ RECORD = AddToQuarantine(VERDICT, Request(b"c", 0, 0))
 
 
 class Scripted:
-    """A dispatcher whose first tick says what the test says, and which writes down what it is told."""
+    """A dispatcher whose first tick says what the test says, and which writes down what it is told. It is its own
+    broker."""
 
     def __init__(
         self, first: Sequence[Action] = (), after_record: Sequence[Action] = (), workers: Sequence[bytes] = ()
@@ -54,7 +58,7 @@ class Scripted:
         self.times: list[float] = []
         self.blocked_reason = ""
         self.counters = Counters()
-        self._there = peers().dispatcher
+        self._there, self.broker = peers().broker, self
         for worker in workers:
             self._there.registry.add(worker, WorkerHello(worker.decode(), NUMERICS_VERSION, 2), 0.0)
 
@@ -74,11 +78,15 @@ class Scripted:
         self.told.append(("looked for", missing, found))
         return []
 
+    def not_granted(self, grants: Sequence[Grant], error: V2VError, now: float) -> list[Action]:
+        self.told.append(("not granted", [grant.identity for grant in grants], str(error)))
+        return []
+
     def worker_lost(self, identity: bytes, loss: Loss, now: float) -> list[Action]:
         self.told.append(("lost", identity, loss))
         return []
 
-    def worker_unreachable(self, identity: bytes, now: float) -> list[Action]:
+    def worker_gone(self, identity: bytes, now: float) -> list[Action]:
         self.told.append(("unreachable", identity))
         return []
 
@@ -159,6 +167,33 @@ def test_a_record_waits_for_another_writer_and_the_server_does_not(is_freed: boo
     times[0] = 3.0
     server.turn(0.0)
     assert dispatcher.told == [("recorded", RECORD, [replace(VERDICT, snapshot=1)] if is_freed else [])]
+
+
+GRANTS = [Grant(name, (), SMALL_SPEC, True) for name in (b"1", b"2", b"3")]
+
+
+@pytest.mark.parametrize("is_locked", [True, False])
+def test_leases_that_cannot_be_completed_are_reported(
+    is_locked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While the index is locked only one is tried: each attempt may wait for a disk."""
+    tried: list[StreamSpec] = []
+
+    def refuse(lease: Lease, catalogue: Catalogue, spec: StreamSpec) -> Lease:
+        tried.append(spec)
+        raise IndexUnreadable("locked") if is_locked else ProtocolError("damaged")
+
+    monkeypatch.setattr(serve_module, "complete_lease", refuse)
+    leases = [replace(grant, leases=(cast(Lease, number),)) for number, grant in enumerate(GRANTS)]
+    dispatcher = Scripted([*leases[:1], ToConsumer(b"gone", encode(Pong())), *leases[1:]])
+    served(dispatcher, tmp_path)
+    assert len(tried) == (1 if is_locked else 3)
+    assert [told for told in dispatcher.told if told[0] == "not granted"] == (
+        [("not granted", [b"1", b"2", b"3"], "locked")]
+        if is_locked
+        else [("not granted", [name], "damaged") for name in (b"1", b"2", b"3")]
+    )
+    assert ("consumer lost", b"gone") in dispatcher.told  # all else is still carried out
 
 
 @pytest.mark.parametrize("found", [True, False])
@@ -278,13 +313,13 @@ def test_with_json_every_line_is_an_object_and_one_on_a_sample_has_its_identity(
     at.hello(b"c", seed=5)
     request = Request(b"c", 2, 7)
     dispatcher = Scripted([ReportRefusal(Refusal("a.mp4", 7, "cut short"), request), AddToQuarantine(VERDICT, request)])
-    dispatcher._there = at.dispatcher
+    dispatcher._there = at.broker
     server = served(dispatcher, tmp_path, log_format="json")
     server.close()
     lines: list[dict[str, Any]] = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
     assert all({"time", "level", "text"} <= line.keys() for line in lines)
     passed_over, condemned = (next(line for line in lines if word in line["text"]) for word in ("passed", "quarantine"))
-    session = at.dispatcher.sessions.get(b"c")
+    session = at.broker.sessions.get(b"c")
     assert session is not None
     assert passed_over["sample"] == {
         "spec_digest": session.spec.digest, "catalogue_digest": "c" * 32, "numerics_version": NUMERICS_VERSION,

@@ -11,7 +11,7 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -37,15 +37,18 @@ def totals(address: str) -> dict[str, Any]:
         return found
 
 
-def open_files(pid: int) -> Counter[str]:
-    """Kinds of what a process has open: sockets and shared memory each count as one."""
+def open_names(pid: int) -> list[str]:
+    """Return what each descriptor of a process refers to."""
     names = []
     for descriptor in Path(f"/proc/{pid}/fd").iterdir():
-        try:
-            names.append(os.readlink(descriptor).partition(":")[0])
-        except FileNotFoundError:
-            continue  # closed meanwhile
-    return Counter(names)
+        with suppress(FileNotFoundError):  # closed meanwhile
+            names.append(os.readlink(descriptor))
+    return names
+
+
+def open_files(pid: int) -> Counter[str]:
+    """Count what a process has open by kind: sockets and shared memory each count as one kind."""
+    return Counter(name.partition(":")[0] for name in open_names(pid))
 
 
 @contextmanager
@@ -115,10 +118,10 @@ def test_a_killed_workers_successor_gets_slots_and_a_consumer_that_leaves_no_mem
     until(
         lambda: (
             not [
-                each
-                for process in (psutil.Process(server.pid), successor)
-                for each in Path(f"/proc/{process.pid}/fd").iterdir()
-                if "v2v-" in os.readlink(each) and "logbook" not in os.readlink(each)
+                name
+                for process in (server.pid, successor.pid)
+                for name in open_names(process)
+                if "v2v-" in name and "logbook" not in name
             ]
         )
     )

@@ -1,4 +1,4 @@
-"""An array from a sidecar and a kind of source, added to the packages as `docs/extending.md` says."""
+"""An array from a sidecar, a kind of video and a kind of source, added to the packages as `docs/extending.md` says."""
 
 from __future__ import annotations
 
@@ -16,11 +16,14 @@ from tests.test_seams import add
 
 ROOT = Path(__file__).parents[2]
 
-FORM, BUILDER = re.findall(
-    r"```python\n(.*?)```",
-    (ROOT / "docs/extending.md").read_text("utf-8").partition("### An array from a file beside the video")[2],
-    re.DOTALL,
-)[:2]
+
+def shown_below(heading: str) -> list[str]:
+    """Return the code that the page shows from a heading on."""
+    page = (ROOT / "docs/extending.md").read_text("utf-8")
+    return re.findall(r"```python\n(.*?)```", page.partition(f"{heading}\n")[2], re.DOTALL)
+
+
+FORM, BUILDER = shown_below("### An array from a file beside the video")[:2]
 """The line and the file that the page shows for depth."""
 DEPTH_LINES = (
     ("v2v_protocol/sample.py", '    "flow_valid": ArrayForm(', FORM),
@@ -63,6 +66,9 @@ def open_source(name, options):
     return Toy(name) if name.startswith("toy:") else None
 '''
 SOURCE_LINE = ("v2v_server/corpus/sources/source.py", '"copies", "prepared"', '"toy", ')
+
+KIND, *_ = shown_below("## A kind of video")
+KIND_LINE = ("v2v_server/kinds/registry.py", '    "photographs",', '    "stripes",\n')
 
 OVERLAY = '''
 """Import a module from this folder if it is there. All others, the kernels too, are those of the packages."""
@@ -191,13 +197,80 @@ assert {each.video for batch in batches for each in batch.provenance} == {"toys/
 """
 
 
+USE_KIND = """
+import json, sys
+from contextlib import closing
+from pathlib import Path
+import numpy as np
+from v2v_client import V2VStreamDataset
+from v2v_client.local_server import LocalServer
+from v2v_protocol.errors import UsageError
+from v2v_protocol.spec import StreamSpec
+from v2v_server.commands.prepare import main as prepare
+from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.kinds.registry import kind_from
+from v2v_server.kinds.stripes import StripesKind
+from v2v_tools.doctor.command import main as doctor
+from v2v_tools.preview import main as preview
+from v2v_tools.remake import remake
+from v2v_tools.simulate import main as simulate
+
+folder, cache = Path(sys.argv[1]).with_name("stripes"), sys.argv[2]
+folder.mkdir()
+for name in "ab":
+    (folder / f"{name}.stripes").write_text("60 48 64")
+fields = dict(voxels_per_clip=4, crop_height_px=32, crop_width_px=32)
+small = [f"--set={name}={value}" for name, value in fields.items()]
+kind = ["--videos-kind", "stripes", "--stripe-hz", "50"]
+here = ["--cache-dir", cache, *kind]
+
+def opened(path=folder, **flags):
+    return closing(open_catalogue(path, cache_dir=cache, processes=0, kind=StripesKind(**flags)))
+
+# The flag has an effect on what is indexed already.
+with opened() as first, opened(stripe_hz=50.0) as second:
+    assert set(first.videos.frames_per_second) == {25.0} and set(second.videos.frames_per_second) == {50.0}
+    assert first.digest != second.digest and second.kind.name == "stripes"
+    digest = second.digest
+
+with LocalServer(folder, workers=1, flags=[*here, *small]) as server:
+    batches = list(V2VStreamDataset(server.address, batch_size=2, arrays=("voxels", "frames"), seed=1))
+state = batches[0].resume_state
+assert state["catalogue_digest"] == digest, state
+with opened(stripe_hz=50.0) as catalogue:
+    for batch in batches:
+        for row, origin in enumerate(batch.provenance):
+            made = remake(catalogue, StreamSpec.from_dict(state["spec"]), seed=1, epoch=0, index=origin.id.index)
+            assert np.array_equal(made.arrays["voxels"], np.asarray(batch["voxels"][row]))
+            assert origin.decoder == "stripes" and made.arrays["voxels"].any()
+
+out = folder.with_name("prepared")
+assert prepare([str(folder), str(out), "--workers", "1", *here]) == 0
+with closing(open_catalogue(out, cache_dir=cache, processes=0)) as prepared:  # a store needs no flag
+    assert (prepared.digest, prepared.kind.name) == (digest, "stripes")
+    made = remake(prepared, StreamSpec.from_dict(state["spec"]), seed=1, epoch=0, index=origin.id.index)
+    assert np.array_equal(made.arrays["voxels"], np.asarray(batch["voxels"][row]))
+
+recipe = folder.with_name("small.yaml")
+recipe.write_text("\\n".join(f"{name}: {value}" for name, value in fields.items()))
+assert doctor(["--videos", str(folder), "--recipe", str(recipe), "--port", "5999", *here]) == 0
+assert preview([str(folder), "--out", str(folder.with_name("sheet.png")), "--seeds", "1", *here, *small]) == 0
+assert simulate([str(folder), "--out", str(folder.with_name("one.npz")), "--index", "0", *here, *small]) == 0
+try:
+    kind_from({"videos_kind": "videos", "stripe_hz": 50.0})
+    raise AssertionError("no error")
+except UsageError as error:
+    assert str(error).startswith("--stripe-hz 50.0 has no effect without --videos-kind stripes"), error
+"""
+
+
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The files with both additions, which an import prefers to those of the packages, and two clips."""
+    """The files with these additions, which an import prefers to those of the packages, and two clips."""
     tmp_path = tmp_path_factory.mktemp("tree")
-    for name in ("v2v_server/worker/arrays", "v2v_server/corpus/sources", "v2v_protocol"):
+    for name in ("v2v_server/worker/arrays", "v2v_server/corpus/sources", "v2v_server/kinds", "v2v_protocol"):
         (tmp_path / name).mkdir(parents=True)
-    for name, *_ in (*DEPTH_LINES, SOURCE_LINE):
+    for name, *_ in (*DEPTH_LINES, SOURCE_LINE, KIND_LINE):
         shutil.copy(ROOT / name, tmp_path / name)
     (tmp_path / "sitecustomize.py").write_text(OVERLAY)
     (tmp_path / "clips").mkdir()
@@ -205,7 +278,8 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_clip(tmp_path / "clips" / name, panned_luma(30, 16, 24), gop=12)
     (tmp_path / "v2v_server/worker/arrays/depth.py").write_text(BUILDER)
     (tmp_path / "v2v_server/corpus/sources/toy.py").write_text(SOURCE)
-    add(tmp_path, (*DEPTH_LINES, SOURCE_LINE))
+    (tmp_path / "v2v_server/kinds/stripes.py").write_text(KIND)
+    add(tmp_path, (*DEPTH_LINES, SOURCE_LINE, KIND_LINE))
     return tmp_path
 
 
@@ -227,3 +301,8 @@ def test_an_array_with_a_sidecar_is_a_file_and_two_lines(tree: Path) -> None:
 @pytest.mark.slow
 def test_a_kind_of_source_is_a_file_and_a_line(tree: Path) -> None:
     run(tree, USE_SOURCE)
+
+
+@pytest.mark.slow
+def test_a_kind_of_video_is_a_file_and_a_name(tree: Path) -> None:
+    run(tree, USE_KIND)

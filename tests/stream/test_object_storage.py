@@ -6,9 +6,12 @@ import logging
 import os
 import re
 import shutil
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from importlib.util import find_spec
+from itertools import islice
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -16,10 +19,12 @@ from urllib.parse import unquote
 import pytest
 
 from bench.processes import free_ports
+from tests.packed import pack
 from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of
 from tests.waiting import until
 from v2v_client import V2VStreamDataset
 from v2v_client.local_server import LocalServer
+from v2v_server.corpus.catalogue import open_catalogue
 
 # Looked for, not imported: the fast tests are collected without them.
 missing = [name for name in ("moto", "s3fs") if find_spec(name) is None]
@@ -45,6 +50,7 @@ class Bucket:
 
     def __init__(self) -> None:
         self.fetched: list[str] = []
+        self.asked: list[str] = []
         self._server = _server_at("127.0.0.1", free_ports(1)[0])  # which it gets again after a pause
         host, port = self._server.get_host_and_port()
         self.address = f"http://{host}:{port}"
@@ -55,6 +61,7 @@ class Bucket:
         self._handler = handler
 
     def _note(self, record: logging.LogRecord) -> None:
+        self.asked.append(record.getMessage())
         found = re.search(r'"?GET /corpus/videos/([^? ]+)(\?\S*)? HTTP', record.getMessage())
         if found:
             self.fetched.append(unquote(found[1]))
@@ -64,13 +71,14 @@ class Bucket:
 
         return boto3.client("s3", endpoint_url=self.address, region_name="us-east-1")
 
-    def fill(self, folder: Path) -> None:
+    def fill(self, folder: Path, below: str = "videos") -> None:
         client = self.client()
         client.create_bucket(Bucket="corpus")
         for path in sorted(folder.rglob("*")):
             if path.is_file():
-                client.upload_file(str(path), "corpus", f"videos/{path.relative_to(folder).as_posix()}")
+                client.upload_file(str(path), "corpus", f"{below}/{path.relative_to(folder).as_posix()}")
         self.fetched.clear()
+        self.asked.clear()
 
     def pause(self) -> None:
         """Stop answering."""
@@ -155,3 +163,37 @@ def test_a_store_that_is_away_condemns_no_video(clips: Path, bucket: Bucket, tmp
         bucket.go_on()
         assert epoch.result(120) == reference
         assert "passed over" not in all_lines(server)
+
+
+def test_a_tar_of_600_members_is_one_question_to_list_one_to_index_and_one_a_member(
+    clips: Path, bucket: Bucket, tmp_path: Path
+) -> None:
+    """Half of them are videos. The samples are those of the files unpacked."""
+    below, videos = tmp_path / "plain" / "0", [path for path in sorted(clips.rglob("*")) if path.is_file()]
+    below.mkdir(parents=True)
+    for number in range(300):
+        shutil.copy(videos[number % len(videos)], below / f"{number:03}{videos[number % len(videos)].suffix}")
+        (below / f"{number:03}.txt").write_text("a caption")
+    pack(below, tmp_path / "tar" / "0.tar")
+    bucket.fill(tmp_path / "tar", "tar")
+    cache = tmp_path / "cache"
+    with (
+        closing(open_catalogue(below.parent, cache_dir=cache)) as plain,
+        closing(open_catalogue("s3://corpus/tar", cache_dir=cache, processes=2)) as packed,
+    ):
+        assert (packed.digest, len(packed.videos)) == (plain.digest, 300)
+    assert questions(bucket) == {"GET /corpus": 1, "GET /corpus/tar/0.tar": 1 + 300}
+    forget_copies(tmp_path)
+    bucket.asked.clear()
+    found = {}
+    for source in (below.parent, "s3://corpus/tar"):
+        with LocalServer(source, workers=2, flags=SMALL_FLAGS) as server:
+            found[source] = list(map(digest, islice(stream_of(server), 6)))
+    assert len(set(map(tuple, found.values()))) == 1
+    asked = questions(bucket)
+    assert asked.keys() == {"GET /corpus", "GET /corpus/tar/0.tar"}, "workers need no table, and ask nothing else"
+    assert asked["GET /corpus"] == 1
+
+
+def questions(bucket: Bucket) -> Counter[str]:
+    return Counter(re.sub(r".*(GET|HEAD) (/corpus[^? ]*).* HTTP.*", r"\1 \2", text) for text in bucket.asked)

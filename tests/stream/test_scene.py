@@ -19,7 +19,8 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.sample import Provenance, Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.schedule import SequenceTable, corpus_summary
+from v2v_server.corpus_words import corpus_summary
+from v2v_server.schedule import SequenceTable
 from v2v_server.worker.scene_choice import LEAN_METHOD
 from v2v_tools.remake import remake
 
@@ -81,7 +82,7 @@ def test_the_provenance_says_how_a_crop_was_drawn(catalogue: Catalogue) -> None:
 def test_a_start_says_how_many_videos_are_longer_than_what_is_analysed(
     catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("v2v_server.schedule.MOST_ANALYSED_FRAMES", 42)
+    monkeypatch.setattr("v2v_server.corpus_words.MOST_ANALYSED_FRAMES", 42)
     said = corpus_summary(catalogue, AUTO, SequenceTable(catalogue.videos, catalogue.rows, AUTO))
     assert any(line.startswith("1 video is longer than the 42 frames that are analysed") for line in said)
 

@@ -16,7 +16,7 @@ from tests.stream.conftest import SMALL_FLAGS, epoch_of, server_workers
 from tests.waiting import until
 from v2v_client.local_server import LocalServer
 from v2v_protocol.messages import Denied, Ping, Pong, decode, encode
-from v2v_server.worker.process import LARGEST_MEMORY_BYTES
+from v2v_server.lease_memory import LARGEST_MEMORY_BYTES
 
 
 def _ask(dealer: zmq.Socket[bytes], *frames: bytes) -> object:

@@ -1,28 +1,50 @@
 """Trace one sample through the files of the project, from the request to the batch.
 
-Run: python -m tests.tools.trace CLIP
+Run: python -m tests.tools.trace CLIP, or --write to bring the table in docs/architecture.md up to date
 
 A server with one worker serves one sequence of a clip; a consumer takes it in epoch 0. Each process of the three notes
 every call of a function of the project, with the time. The way of the sample is, for each process, the first call of
 each function between the consumer's connecting and its batch, without the functions that are also called while no
-sample is asked for. A profiler does not see compiled kernels, but the function that enters them.
+sample is asked for. That is done several times, with new processes, and only functions that are called every time
+count: pings and waits depend on how busy the host is. A profiler does not see compiled kernels, but the function that
+enters them.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
 import os
+import re
 import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
+from tests.clips import panned_luma, write_clip
 from v2v_server.status.client import StatusClient
 
 ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "architecture.md"
+HEADING = "### By file and function"
+_SECTION = """{heading}
+
+The files that one sample of the paper's recipe visits, which a local worker decodes from a file: {files} files, and \
+{returns} returns to an earlier one. Each process has its files in the order in which it enters them first, and the \
+function that it enters there. `python -m tests.tools.trace --write` makes this table.
+
+| process | file | enters | what that does |
+|---|---|---|---|
+{table}
+
+"""
+_PROCESSES = {"worker": "v2v_server/worker/process.py", "consumer": "v2v_client/dataset.py"}
+"""A file by which a process is known; the other one is the server."""
+RUNS = 3
 PACKAGES = ("v2v_protocol", "v2v_server", "v2v_tools", "v2v_client", "v2v_pictures", "v2v_recordings")
 FOLDER = "V2V_TRACE_FOLDER"
 _QUIET_SECONDS = 3.0
@@ -41,7 +63,7 @@ def note(frame, event, argument):
     if name is None:
         file = code.co_filename
         ours = file.startswith(ROOT) and file[len(ROOT):].split("/")[0] in PACKAGES and code.co_name[0] != "<"
-        name = NAMES[code] = f"{{file[len(ROOT):]}}:{{code.co_name}}" if ours else ""
+        name = NAMES[code] = f"{{file[len(ROOT):]}}:{{code.co_name}}:{{code.co_qualname}}" if ours else ""
     if name:
         try:
             os.write(TO, f"{{time.monotonic_ns()}} {{name}}\\n".encode())
@@ -71,6 +93,7 @@ class Call(NamedTuple):
     nanoseconds: int
     file: str
     function: str
+    full_name: str
 
 
 @dataclass(frozen=True)
@@ -80,10 +103,25 @@ class Way:
     Attributes:
         steps: (file, function) for each process, in the order of time.
         idle: what is also called while no sample is asked for.
+        full_names: of each step in a process, with the class: (number of the process, file, function) -> name.
     """
 
     steps: list[list[tuple[str, str]]]
     idle: set[tuple[str, str]]
+    full_names: Mapping[tuple[int, str, str], str] = field(default_factory=dict)
+
+    @classmethod
+    def common(cls, ways: Sequence[Way]) -> Way:
+        """Return the steps that all ways of one sample have, in the order of the way with the fewest returns."""
+        idle = set[tuple[str, str]]().union(*(way.idle for way in ways))
+        in_all = [
+            set[tuple[str, str]].intersection(*map(set, each)) for each in zip(*(w.steps for w in ways), strict=True)
+        ]
+        kept = [
+            [[step for step in process if step in always] for process, always in zip(way.steps, in_all, strict=True)]
+            for way in ways
+        ]
+        return min(map(cls, kept, [idle] * len(kept), [way.full_names for way in ways]), key=lambda way: way.returns)
 
     @property
     def files(self) -> int:
@@ -100,16 +138,25 @@ class Way:
         return total
 
 
-def trace(folder: Path, clip: Path) -> Way:
+def trace(folder: Path, clip: Path, runs: int = RUNS) -> Way:
     """Serve one sample of the clip to one consumer; return its way.
 
     Args:
         folder: an empty folder.
         clip: a video of at least 21 frames.
+        runs: times that it is served; steps of some of them only do not count.
 
     Raises:
         RuntimeError: a process failed; with what it printed.
     """
+    ways = []
+    for number in range(runs):
+        (folder / str(number)).mkdir()
+        ways.append(_traced(folder / str(number), clip))
+    return Way.common(ways)
+
+
+def _traced(folder: Path, clip: Path) -> Way:
     (folder / "calls").mkdir()
     (folder / "site").mkdir()
     site = _SITE.format(folder=FOLDER, root=f"{ROOT}/", packages=PACKAGES)
@@ -139,24 +186,77 @@ def trace(folder: Path, clip: Path) -> Way:
     if consumer.returncode:
         raise RuntimeError(f"{consumer.stderr}\n{(folder / 'log').read_text('utf-8')}")
     began, ended, quiet = map(int, consumer.stdout.split())
-    steps, every_idle = [], set()
+    steps, every_idle, full_names = [], set[tuple[str, str]](), dict[tuple[int, str, str], str]()
     for file in sorted((folder / "calls").iterdir(), key=lambda file: int(file.stem)):
-        calls = [Call(int(at), *name.split(":")) for at, name in map(str.split, file.read_text("utf-8").splitlines())]  # type: ignore[call-arg]
-        idle = {call[1:] for call in calls if ended + 5e8 < call.nanoseconds < quiet - 1e8}
+        lines = (re.split("[ :]", line) for line in file.read_text("utf-8").splitlines())
+        calls = [Call(int(at), *names) for at, *names in lines]  # type: ignore[call-arg]
+        idle = {call[1:3] for call in calls if ended + 5e8 < call.nanoseconds < quiet - 1e8}
         every_idle |= idle
-        asked = (call[1:] for call in calls if began <= call.nanoseconds <= ended)
-        steps.append([step for step in dict.fromkeys(asked) if step not in idle])
-    return Way([process for process in steps if process], every_idle)
+        asked = [call for call in calls if began <= call.nanoseconds <= ended and call[1:3] not in idle]
+        if asked:
+            full_names |= {(len(steps), *call[1:3]): call.full_name for call in reversed(asked)}
+            steps.append(list(dict.fromkeys(call[1:3] for call in asked)))
+    return Way(steps, every_idle, full_names)
+
+
+def sentence(file: str, name: str) -> str:
+    """Return the first sentence of the docstring of a function; of its class or file if it has none.
+
+    Args:
+        name: with its class: "Batch.to".
+
+    Raises:
+        StopIteration: there is no such function.
+    """
+    node: ast.AST = ast.parse((ROOT / file).read_text("utf-8"))
+    texts = [ast.get_docstring(node)]  # type: ignore[arg-type]
+    for part in name.replace(".<locals>", "").split("."):
+        node = next(each for each in nodes_of_names(node) if each.name == part)
+        texts.append(ast.get_docstring(node))
+    text = " ".join(next(filter(None, reversed(texts)), "").partition("\n\n")[0].split())
+    return re.split(r"(?<=[.:]) ", text)[0].rstrip(":.").replace("|", "\\|") + "."
+
+
+def nodes_of_names(node: ast.AST) -> Iterator[ast.FunctionDef | ast.ClassDef]:
+    """Yield the classes and functions of a module, class or function, under conditions as well."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.FunctionDef | ast.ClassDef):
+            yield child
+        else:
+            yield from nodes_of_names(child)
+
+
+def section(way: Way) -> str:
+    """Return the section of the page: for each process the files that it visits, in order of their first function."""
+    rows = dict[str, list[str]](consumer=[], server=[], worker=[])
+    for number, steps in enumerate(way.steps):
+        first = dict(reversed(steps))
+        process = next((name for name, file in _PROCESSES.items() if file in first), "server")
+        for file in dict.fromkeys(file for file, _ in steps):
+            function = way.full_names.get((number, file, first[file]), first[file])
+            rows[process].append(f"| {process} | `{file}` | `{function}` | {sentence(file, function)} |")
+    table = "\n".join(row for each in rows.values() for row in each)
+    return _SECTION.format(heading=HEADING, files=way.files, returns=way.returns, table=table)
 
 
 def main() -> None:
     """Print the way of one sample of a clip, a function a line, and how many files and returns it has."""
     parser = argparse.ArgumentParser(description="Trace one sample through the files of the project.")
-    parser.add_argument("clip", type=Path)
+    parser.add_argument("clip", type=Path, nargs="?", help="a video (default: one that is made)")
+    parser.add_argument("--write", action="store_true", help="write the table of docs/architecture.md")
+    given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        way = trace(Path(folder), parser.parse_args().clip.resolve())
-    for process in way.steps:
-        print(*(f"{file}:{function}" for file, function in process), sep="\n", end="\n\n")
+        clip = given.clip or Path(folder, "clip.mp4")
+        if given.clip is None:
+            write_clip(clip, panned_luma(200, 48, 64), gop=200, b_frames=2)
+        way = trace(Path(folder), clip.resolve())
+    if given.write:
+        page = PAGE.read_text("utf-8")
+        before, rest = page.split(HEADING)
+        PAGE.write_text(before + section(way) + rest[rest.index("## ") :], "utf-8")
+    else:
+        for process in way.steps:
+            print(*(f"{file}:{function}" for file, function in process), sep="\n", end="\n\n")
     print(f"{way.files} files, {way.returns} returns, {sum(map(len, way.steps))} functions")
 
 

@@ -141,6 +141,8 @@ def test_numbers_without_a_point_are_numbers(tmp_path):
         ("optimizer.ema_decay=1", r"optimizer\.ema_decay = 1: give a number from 0 to 0\.999999"),
         ("optimizer.amsgrad=1", r"optimizer\.amsgrad = 1: give true or false"),
         ("optimizer.name=sgd", r"optimizer\.name = 'sgd': choose one of adam, adamw"),
+        ("compute.channels_last=maybe", r"compute\.channels_last = 'maybe': give true, false or auto"),
+        ("compute.channels_last=1", r"compute\.channels_last = 1: give true, false or auto"),
         ("network.name=unet", r"network\.name = 'unet': choose one of e2vid, .*firenet"),
         ("network.options.bins=4", r"network\.options\.bins: set stream\.recipe\.bins"),
         ("stream.batch_size=0", r"stream\.batch_size = 0: give a whole number from 1"),

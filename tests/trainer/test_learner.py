@@ -5,20 +5,24 @@ from __future__ import annotations
 import dataclasses
 from functools import partial
 from pathlib import Path
+from typing import Any, Literal
 
 import pytest
 import torch
 
 from tests.trainer.training import ALONE, configured
+from trainer.config import ComputeConfig
 from trainer.config_file import load_config
-from trainer.learner import build, obeying_weights
+from trainer.learner import build, channels_last, obeying_weights
 from trainer.models import FireNet
 from trainer.models.blocks import Loop
 from trainer.run.checkpoint import load_checkpoint, save_checkpoint
 from trainer.run.distributed import Ranks
 from trainer.tasks import Work
+from trainer.train import main
 from trainer.weights import SHIPPED, load_network
 from v2v_protocol.errors import UsageError
+from v2v_protocol.safe_yaml import parse_yaml
 
 
 def test_a_training_begins_with_the_shipped_weights() -> None:
@@ -52,6 +56,49 @@ def test_the_optimiser_resumes_in_another_memory_format(
         each.step(work, 3, 0)
     for name, tensor in before.network.state_dict().items():
         assert torch.allclose(after.network.state_dict()[name], tensor, rtol=0, atol=1e-5), name
+
+
+@pytest.mark.parametrize(
+    ("said", "device", "precision", "last"),
+    [
+        ("auto", "cpu", "float32", True),
+        ("auto", "cuda", "float32", False),
+        ("auto", "cuda", "tf32", True),
+        ("auto", "cuda", "bfloat16", True),
+        (False, "cpu", "tf32", False),
+        (True, "cuda", "float32", True),
+    ],
+)
+def test_the_memory_format_follows_device_and_precision(
+    said: bool | str, device: str, precision: Literal["float32", "tf32", "bfloat16"], last: bool
+) -> None:
+    compute = ComputeConfig(channels_last=said, precision=precision)
+    assert channels_last(compute, torch.device(device)) is last
+
+
+@pytest.mark.parametrize(
+    ("saved", "file", "expected"),
+    [
+        ({"precision": "float32", "channels_last": False}, "", ("float32", False)),
+        ({"precision": "tf32", "channels_last": "auto"}, "", ("tf32", "auto")),
+        ({}, "", ("float32", False)),  # of a release without these keys
+        ({"precision": "float32", "channels_last": False}, "compute: {precision: bfloat16}", ("bfloat16", False)),
+    ],
+)
+def test_a_resumed_run_keeps_the_precision_of_its_checkpoint(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], saved: dict[str, Any], file: str,
+    expected: tuple[str, bool | str],
+) -> None:  # fmt: skip
+    """Not the default, which may have changed since; what the file says goes first."""
+    plain = build(load_config(configured(tmp_path)), ALONE).checkpoint(1, None)
+    others = {key: value for key, value in plain.config["compute"].items() if key not in ("precision", "channels_last")}
+    config = {**plain.config, "compute": others | saved}
+    save_checkpoint(tmp_path / "last.pt", dataclasses.replace(plain, config=config))
+    (tmp_path / "mine.yaml").write_text(file)
+    assert main([str(tmp_path / "mine.yaml"), "--resume", str(tmp_path / "last.pt"), "--show-config"]) == 0
+    shown = parse_yaml(capsys.readouterr().out)["compute"]
+    assert (shown["precision"], shown["channels_last"]) == expected
+    assert (ComputeConfig().precision, ComputeConfig().channels_last) == ("tf32", "auto")
 
 
 def test_weights_determine_the_network_and_the_configuration_overrides(tmp_path: Path) -> None:

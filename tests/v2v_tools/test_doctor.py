@@ -16,6 +16,7 @@ import pytest
 
 from bench.processes import free_ports
 from tests.clips import damaged, panned_luma, truncated, write_clip
+from v2v_protocol.programs import install_line
 from v2v_protocol.recipe import Recipe
 from v2v_server.corpus.catalogue import open_catalogue
 from v2v_server.corpus.scenes import picture_check
@@ -133,7 +134,15 @@ def test_what_is_missing_or_too_old_is_named(
     assert {"av<19,>=18", "pyzmq>=26"} == set(command._missing("trainer"))  # one of its own, one of the client's
     status, said = told(capsys, "--videos", ".")
     assert status == 1  # neither part is whole
-    assert "pip install '.[server]'" in said
+    assert install_line("server") in said
+
+
+def test_opencv_without_contrib_serves_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    here = metadata.version("opencv-contrib-python-headless")
+    pretend(monkeypatch, {"opencv-contrib-python-headless": None, "opencv-python-headless": here})
+    assert command._missing("server") == []
+    pretend(monkeypatch, {"opencv-contrib-python-headless": None, "opencv-python-headless": "4.5"})
+    assert command._missing("server") == ["opencv-contrib-python-headless>=4.10"]
 
 
 def test_a_server_without_torch_is_whole(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

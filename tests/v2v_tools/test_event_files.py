@@ -14,10 +14,10 @@ from tests.clips import panned_luma, write_clip
 from v2v_protocol.errors import UsageError
 from v2v_protocol.events import EventList
 from v2v_recordings.limits import FORM_LIMITS
+from v2v_recordings.writers import ENDINGS, EVENT_FORMS, write_events
 from v2v_server.simulation import simulate
 from v2v_server.simulation.kernels import Voxels
 from v2v_tools import simulate as command
-from v2v_tools.event_files import EVENT_WRITERS, write_events
 
 BIN_US = 7000.0
 
@@ -50,7 +50,7 @@ def read(path: Path) -> EventList:
     return EventList(table["x"], table["y"], table["t"].astype(np.int64), table["on"], *stream.dimensions())
 
 
-@pytest.mark.parametrize("ending", EVENT_WRITERS)
+@pytest.mark.parametrize("ending", ENDINGS)
 def test_what_is_read_is_what_was_written(ending: str, tmp_path: Path) -> None:
     path, events = tmp_path / f"events{ending}", some_events()
     write_events(path, events)
@@ -71,7 +71,7 @@ def test_the_index_of_milliseconds_is_that_of_dsec(tmp_path: Path) -> None:
         assert index == 0 or t[index - 1] < ms * 1000
 
 
-@pytest.mark.parametrize("ending", EVENT_WRITERS)
+@pytest.mark.parametrize("ending", ENDINGS)
 def test_no_events_make_a_file_too(ending: str, tmp_path: Path) -> None:
     none = simulate(np.zeros((6, 4, 4), np.uint8), threshold_pos=1.0, start_residual=0.0).to_events(100)
     write_events(tmp_path / f"none{ending}", none)
@@ -84,9 +84,9 @@ def listed(width_px: int, height_px: int, *t_us: int) -> EventList:
     return EventList(*places, np.array(t_us, np.int64), np.ones(len(t_us), bool), width_px, height_px)
 
 
-@pytest.mark.parametrize("ending", EVENT_WRITERS)
+@pytest.mark.parametrize("ending", ENDINGS)
 def test_the_largest_picture_is_written_and_larger_ones_are_refused(ending: str, tmp_path: Path) -> None:
-    side = FORM_LIMITS[EVENT_WRITERS[ending].form].side_px
+    side = FORM_LIMITS[EVENT_FORMS[ENDINGS[ending]].limit].side_px
     path = tmp_path / f"events{ending}"
     for size in ((side, 2), (2, side)):
         events = listed(*size, 5, 9)
@@ -102,9 +102,9 @@ def test_the_largest_picture_is_written_and_larger_ones_are_refused(ending: str,
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("ending", EVENT_WRITERS)
+@pytest.mark.parametrize("ending", ENDINGS)
 def test_late_times_are_written_or_refused(ending: str, tmp_path: Path) -> None:
-    path, end_us = tmp_path / f"events{ending}", FORM_LIMITS[EVENT_WRITERS[ending].form].end_us
+    path, end_us = tmp_path / f"events{ending}", FORM_LIMITS[EVENT_FORMS[ENDINGS[ending]].limit].end_us
     if end_us < 2**36:
         with pytest.raises(UsageError, match=rf"an event at {end_us} us; .* holds times below {end_us} us: give"):
             write_events(path, listed(4, 4, 7, end_us))
@@ -113,7 +113,7 @@ def test_late_times_are_written_or_refused(ending: str, tmp_path: Path) -> None:
     assert read(path).t.tolist() == [7, last_us]
 
 
-@pytest.mark.parametrize("ending", EVENT_WRITERS)
+@pytest.mark.parametrize("ending", ENDINGS)
 def test_events_outside_of_the_picture_are_refused(ending: str, tmp_path: Path) -> None:
     wrong = dataclasses.replace(listed(9, 9, 5), height_px=8)
     with pytest.raises(UsageError, match=r"events reach x = 8, y = 8, outside of the picture of 9 x 8 px"):
@@ -124,7 +124,7 @@ def test_the_program_refuses_a_picture_before_any_work(tmp_path: Path, capsys: p
     line = ["missing.mp4", "--out", str(tmp_path / "s.npz"), "--set", "crop_width_px=2049", "--events"]
     assert command.main([*line, str(tmp_path / "e.raw")]) == 2
     said = capsys.readouterr().err
-    assert "EVT 3 holds at most 2048 px a side: give a smaller crop, or another ending: .h5, .hdf5, .npz, .aed" in said
+    assert "EVT 3 holds at most 2048 px a side: give a smaller crop, or another form: h5, dsec, npz, aed" in said
     assert command.main([*line, str(tmp_path / "e.dat")]) == 2
     assert "missing.mp4" in capsys.readouterr().err
 

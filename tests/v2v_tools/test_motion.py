@@ -58,27 +58,27 @@ def test_the_whole_picture_is_simulated_small_and_without_noise(
     corpus: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spec = stream(noise_sigma=[0.1, 0.1], pause_probability=0.5, threshold=[2.0, 2.0], shot_noise_hz=[5.0, 5.0])
-    sequence = Remaker(corpus, spec).sequence(0, 0, 0)
-    whole = WholePictures(corpus, spec).camera(sequence)
+    job = Remaker(corpus, spec).job(0, 0, 0)
+    whole = WholePictures(corpus).camera(job)
     assert whole.voxels.shape == (3, 2, 96, 160)
     assert not whole.voxels[..., :95].any()
     assert whole.voxels[..., 96:].any()
     path, index = corpus.path("half.mkv"), corpus.frame_index("half.mkv")
-    frames = np.stack(list(stream_luma(path, index, sequence.start_frame, 13)))[::2]
+    frames = np.stack(list(stream_luma(path, index, job.clip.start_frame, 13)))[::2]
     assert np.array_equal(whole.voxels, simulate(frames, threshold_pos=0.2, threshold_neg=0.2, bins=2).voxels)
     monkeypatch.setattr(motion, "LONGEST_SIDE_PX", 80)
-    assert WholePictures(corpus, spec).camera(sequence).voxels.shape == (3, 2, 48, 80)
+    assert WholePictures(corpus).camera(job).voxels.shape == (3, 2, 48, 80)
 
 
 def test_seeds_are_chosen_whose_crops_show_motion(corpus: Catalogue) -> None:
     spec = stream(threshold=[0.1, 0.2], noise_sigma=[0.0, 0.01])
     remaker = Remaker(corpus, spec)
-    seeds, moving = moving_seeds(remaker, WholePictures(corpus, spec), 3)
+    seeds, moving = moving_seeds(remaker, WholePictures(corpus), 3)
     assert (len(set(seeds)), moving) == (3, 3)
     assert seeds == sorted(seeds)
     lefts = [remaker.sample(seed, 0, 0).provenance.params.crop_left_px for seed in seeds]
     assert min(lefts) > 96 - 48 + 12  # more than a quarter of the crop moves
-    assert seeds == moving_seeds(remaker, WholePictures(corpus, spec), 3)[0]
+    assert seeds == moving_seeds(remaker, WholePictures(corpus), 3)[0]
 
 
 def test_seeds_are_counted_where_nothing_can_be_read(corpus: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,12 +87,12 @@ def test_seeds_are_counted_where_nothing_can_be_read(corpus: Catalogue, monkeypa
 
     monkeypatch.setattr(WholePictures, "camera", broken)
     spec = stream()
-    assert moving_seeds(Remaker(corpus, spec), WholePictures(corpus, spec), 3) == ([0, 1, 2], 0)
+    assert moving_seeds(Remaker(corpus, spec), WholePictures(corpus), 3) == ([0, 1, 2], 0)
 
 
 def test_a_noisy_camera_counts_as_one_that_sees_no_motion(corpus: Catalogue) -> None:
     spec = stream(threshold=[0.1, 0.1], noise_sigma=[5.0, 5.0])
-    assert moving_seeds(Remaker(corpus, spec), WholePictures(corpus, spec), 2)[1] == 0
+    assert moving_seeds(Remaker(corpus, spec), WholePictures(corpus), 2)[1] == 0
 
 
 @pytest.mark.parametrize("arrays", [("voxels", "frames"), ("voxels", "frames", "flow")])
@@ -176,6 +176,7 @@ def test_the_start_makes_the_events_of_a_still_clip_and_none_if_it_is_zero(tmp_p
 QUIET = MeasuredMotion(
     changed=1000, lost=30, uncovered=120, paired=100, turned=7, speeds=(0,) * 4 + (600,) + (0,) * 252
 )
+TOLD = "tells the error without and with sub-steps, at twice this motion"
 FAST = QUIET._replace(speeds=(0,) * 12 + (500,) + (0,) * 7 + (100,) + (0,) * 236)
 SMALL = FAST._replace(lost=210)
 
@@ -185,7 +186,7 @@ SMALL = FAST._replace(lost=210)
     [
         (MeasuredMotion(), ("0 px", "0 px", "0%", "0%", "0%"), ""),
         (QUIET, ("1 px", "1 px", "7%", "12%", "3%"), ""),
-        (FAST, ("3 px", "5 px", "7%", "12%", "3%"), f"{motion.JUDGE} tells the error without and with sub-steps"),
+        (FAST, ("3 px", "5 px", "7%", "12%", "3%"), f"{motion.JUDGE} {TOLD}"),
         (SMALL, ("3 px", "5 px", "7%", "12%", "21%"), "something small or fast moves, or flickers, or is noise: "
          "sub-steps do not help"),
     ],

@@ -1,4 +1,4 @@
-"""Convert raw recordings of event cameras to the h5 layout that evaluation reads (``trainer.evaluation.layout``)."""
+"""Convert raw recordings of event cameras to the h5 layout that evaluation reads (:mod:`v2v_recordings.layout`)."""
 
 from trainer.convert.conversion import Converted, convert
 from v2v_recordings.items import EventChunk, Item, Picture, SensorSize

@@ -12,12 +12,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from trainer.convert.conversion import Converted, convert, default_name
-from trainer.evaluation import layout
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.progress import Progress
 from v2v_protocol.write_aside import JSON, write_json
-from v2v_recordings import items
+from v2v_recordings import items, layout
 from v2v_recordings.reading import FORMS
 
 

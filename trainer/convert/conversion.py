@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
 import sys
 import tempfile
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from trainer.convert.writer import RecordingWriter, Written
-from trainer.evaluation import layout
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.programs import show
+from v2v_recordings import layout
 from v2v_recordings.items import ConvertOptions, ReadProgress
+from v2v_recordings.late_signals import late_signals
+from v2v_recordings.layout_writer import RecordingWriter, Written
 from v2v_recordings.reading import FORMS, read_items, recognise
 
 EVENT_SUFFIXES = (*layout.SUFFIXES, ".npz", ".raw", ".aedat4", ".es", ".dat", ".bag")
@@ -87,7 +86,7 @@ def convert(
     chosen = FORMS[form]
     try:
         with (
-            _late_signals() as check,
+            late_signals() as check,
             RecordingWriter(
                 destination, source=source.name, size=options.size, published_shift=chosen.published_shift
             ) as writer,
@@ -106,29 +105,6 @@ def convert(
     if writer.written is None:
         raise RuntimeError("the writer was left without finishing")
     return Converted(source, destination, form, writer.written)
-
-
-@contextlib.contextmanager
-def _late_signals() -> Iterator[Callable[[], None]]:
-    """Yield a function that raises KeyboardInterrupt if a Ctrl-C or SIGTERM has come; it comes at no other place.
-
-    Python would raise it in the functions by which HDF5 writes, and HDF5 then ends the process.
-    """
-    came: list[int] = []
-    is_main = threading.current_thread() is threading.main_thread()
-    numbers = (signal.SIGINT, signal.SIGTERM) if is_main else ()
-    before = {number: signal.signal(number, lambda number, _: came.append(number)) for number in numbers}
-
-    def check() -> None:
-        if came:
-            raise KeyboardInterrupt
-
-    try:
-        yield check
-        check()
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextlib.contextmanager

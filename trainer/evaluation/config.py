@@ -22,11 +22,11 @@ from typing import Any
 
 from trainer.evaluation import paper
 from trainer.evaluation.data_sets import DATA_SETS, DataSet, TimeRange
-from trainer.evaluation.layout import SUFFIXES
 from trainer.evaluation.metrics import METRICS
 from trainer.evaluation.voxelise import VoxelSettings
 from v2v_protocol.errors import UsageError
 from v2v_protocol.safe_yaml import YamlError, read_yaml
+from v2v_recordings.layout import SUFFIXES
 
 DEFAULT_METRICS = ("mse", "ssim_range2", "ssim", "correlation")
 KEYS = ("model", "voxels", "metrics", "data", "paper")

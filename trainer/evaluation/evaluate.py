@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from trainer import pictures
-from trainer.evaluation import layout
 from trainer.evaluation.data_sets import DataSet
 from trainer.evaluation.metrics import Metric
 from trainer.evaluation.pictures import choose_steps, draw_recording, draw_step
@@ -20,6 +19,7 @@ from trainer.evaluation.windows import picture_windows, regular_windows, windows
 from trainer.models import VoxelNetwork
 from trainer.precision import ieee_products
 from v2v_protocol.errors import UsageError
+from v2v_recordings import layout
 from v2v_recordings.items import Light
 
 Advance = Callable[[str, int, int], None]

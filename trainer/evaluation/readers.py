@@ -19,9 +19,9 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from trainer.evaluation import layout
 from trainer.evaluation.voxelise import Events
 from v2v_protocol.errors import UsageError
+from v2v_recordings import layout
 from v2v_recordings.event_columns import CLOCK_SLACK_SECONDS, Polarities, clock_fault
 from v2v_recordings.hdf5 import event_index, layout_unit, require_self_contained
 from v2v_recordings.items import ConvertOptions, Light, SensorSize

@@ -137,6 +137,15 @@ def prune_epochs(out: Path, keep: int) -> None:
         path.unlink(missing_ok=True)
 
 
+def numerics_of(checkpoint: Checkpoint) -> dict[str, Any]:
+    """Return the precision and memory format of a run, for a configuration that says nothing of them.
+
+    A checkpoint of a release that had no such key was computed in IEEE float32.
+    """
+    compute = {"precision": "float32", "channels_last": False} | dict(checkpoint.config.get("compute", {}))
+    return {"compute": {key: compute[key] for key in ("precision", "channels_last")}}
+
+
 def require_same_run(checkpoint: Checkpoint, config: TrainConfig) -> list[str]:
     """Check that a configuration continues the run of a checkpoint.
 

@@ -238,6 +238,11 @@ class Dealer:
         return socket
 
 
+def wait_for_any(dealers: Sequence[Dealer], seconds: float) -> None:
+    """Wait at most ``seconds`` until one of several dealers has a message, or something happened to its connection."""
+    zmq.zmq_poll([each for dealer in dealers for each in dealer._poller.sockets], math.ceil(seconds * 1000))
+
+
 def secure(socket: zmq.Socket[bytes], key: PeerKey) -> None:
     """Set a peer's key on its socket. Call it before the socket connects."""
     socket.curve_serverkey = key.server.encode()
@@ -338,7 +343,10 @@ def diagnose(address: str) -> str:
     except (OSError, ValueError) as error:
         return f"nothing listens there ({error}): start v2v-serve, or correct host and port"
     if greeting[:1] == b"\xff":
-        return "a server listens there, and does not answer yet; without keys it answers only root and its own user"
+        return (
+            "a server listens there, and does not answer yet; without keys it answers only root and its own user: run "
+            "this as its user, or use keys (v2v-keys init)"
+        )
     return "another program listens there, or the server's page: give the address that v2v-serve prints when ready"
 
 

@@ -35,7 +35,7 @@ from v2v_protocol.arena import Slot
 from v2v_protocol.liveness import Liveness
 from v2v_protocol.messages import Notes, Result, WorkerHello
 from v2v_protocol.sample import Refusal
-from v2v_server.schedule import LARGEST_MEMORY_BYTES
+from v2v_server.lease_memory import LARGEST_MEMORY_BYTES
 
 ALONE_AFTER = 2
 """Number of unexplained losses after which a sample runs alone."""
@@ -140,7 +140,7 @@ class Request:
 
 
 @dataclass(slots=True)
-class _Grant:
+class _Lease:
     request: Request | None  # None: answered, or its consumer is gone; the worker still works on it
     worker: bytes
     since: float  # when it was granted, or its worker last began something
@@ -179,7 +179,7 @@ class LeaseBook:
 
     def __init__(self, deadline_seconds: float) -> None:
         self.deadline_seconds = deadline_seconds
-        self._leases: dict[int, _Grant] = {}
+        self._leases: dict[int, _Lease] = {}
         self.held: dict[bytes, list[int]] = {}
         self.out: dict[tuple[bytes, int, int], list[int]] = {}
         self.durations: dict[bytes, deque[float]] = {}
@@ -250,7 +250,7 @@ class LeaseBook:
         limit = max(
             [self.deadline_seconds + work_seconds, *(self._leases[n].limit_seconds for n in self.held.get(worker, ()))]
         )
-        self._leases[number] = _Grant(request, worker, now, limit)
+        self._leases[number] = _Lease(request, worker, now, limit)
         self.held.setdefault(worker, []).append(number)
         self.out.setdefault(request.sample, []).append(number)
         self._changed.add(worker)
@@ -343,12 +343,21 @@ class LeaseBook:
         """
         returned = []
         for number in list(self.held.get(worker, ())):
-            lease = self._leases[number]
-            self._drop(number)
-            if lease.request is not None and lease.request.sample not in self.out:
-                begun = lease.begun_at is not None if at is None else number == at
-                returned.append((replace(lease.request, slot=None), begun))
+            begun = self._leases[number].begun_at is not None if at is None else number == at
+            request = self.recall(number)
+            if request is not None and request.sample not in self.out:
+                returned.append((replace(request, slot=None), begun))
         return returned
+
+    def recall(self, number: int) -> Request | None:
+        """Drop a lease, and return its request, which a second worker may still hold; None if it is not wanted or the
+        lease has ended.
+        """
+        lease = self._leases.get(number)
+        if lease is None:
+            return None
+        self._drop(number)
+        return lease.request
 
     def overdue(self, now: float) -> set[bytes]:
         """Return the workers with a lease past its deadline. Their leases stay out until the workers are given up
@@ -365,7 +374,7 @@ class LeaseBook:
 
         The time counts from when its worker last began something, so a request queued behind a hanging one is slow too.
         """
-        oldest: dict[bytes, _Grant] = {}
+        oldest: dict[bytes, _Lease] = {}
         for lease in self._leases.values():
             if lease.request is not None:
                 oldest.setdefault(lease.request.session, lease)
@@ -485,6 +494,10 @@ class Member:
     takes_notes: bool = False
 
 
+def _bounded_credit(stated: int) -> int:
+    return max(1, min(stated, MOST_WORKER_CREDIT))
+
+
 def clean_name(text: str, most: int = LONGEST_NAME) -> str:
     """Make a name, or another text that a peer sent, safe to display: short, and without control characters."""
     return "".join(filter(str.isprintable, text[:most]))
@@ -498,6 +511,7 @@ class Workers:
 
     Attributes:
         members: all of them by routing id.
+        resting: time at which the rest of those ends that get no work for a while.
         least_memory, most_memory: smallest and largest limit of a worker's memory, bytes; 0 without workers.
     """
 
@@ -507,17 +521,11 @@ class Workers:
         self.members: dict[bytes, Member] = {}
         self._names: dict[str, bytes] = {}
         self._unfit = ""  # why the last worker left that cannot work for this server, until a worker makes a sample
-        self._resting: dict[bytes, float] = {}  # time at which their rest ends
+        self.resting: dict[bytes, float] = {}
         # With a thousand workers, only those whose load has changed are examined.
         self._changed: set[bytes] = set()
         self._held: dict[bytes, int] = {}  # leases of each worker with free credit
         self._room: list[tuple[int, bytes]] = []  # the same, sorted
-
-    def __len__(self) -> int:
-        return len(self.members)
-
-    def __contains__(self, identity: bytes) -> bool:
-        return identity in self.members
 
     def name_of(self, identity: bytes) -> str:
         """Return the name of a worker; empty if it has not said hello."""
@@ -528,18 +536,13 @@ class Workers:
         """Return the routing id of the worker of that name; None if there is none."""
         return self._names.get(name)
 
-    def is_resting(self, identity: bytes) -> bool:
-        """Return whether a worker gets no work for a while."""
-        return identity in self._resting
-
     def add(self, identity: bytes, hello: WorkerHello, now: float, user: str = "", owner: bytes = b"") -> None:
         """Add a worker that said hello; none of that routing id or name is there."""
-        room = max(1, min(hello.credit, MOST_WORKER_CREDIT))
         liveness = Liveness(now, gone_seconds=SILENCE_SECONDS)
         limit_bytes = min(hello.notes.memory_bytes or LARGEST_MEMORY_BYTES, LARGEST_MEMORY_BYTES)
         self.members[identity] = Member(
-            hello.name, room, liveness, clean_name(hello.host), user, owner, limit_bytes=limit_bytes,
-            takes_notes=hello.notes != Notes(),
+            hello.name, _bounded_credit(hello.credit), liveness, clean_name(hello.host), user, owner,
+            limit_bytes=limit_bytes, takes_notes=hello.notes != Notes(),
         )  # fmt: skip
         self._names[hello.name] = identity
         self._weigh()
@@ -555,7 +558,7 @@ class Workers:
         if worker is not None:
             del self._names[worker.name]
             self._weigh()
-        self._resting.pop(identity, None)
+        self.resting.pop(identity, None)
         self._changed.add(identity)
 
     def mark_heard(self, identity: bytes, now: float) -> bool:
@@ -565,6 +568,12 @@ class Workers:
             return False
         worker.liveness.mark_heard(now)
         return True
+
+    def set_credit(self, identity: bytes, credit: int) -> None:
+        """Set how many leases a worker takes at a time; 0: no change. Those that it holds stay."""
+        if credit:
+            self.members[identity].credit = _bounded_credit(credit)
+            self._changed.add(identity)
 
     def worked(self, identity: bytes, result: Result, cpu_seconds: float) -> None:
         """Add a wanted sample to the worker's totals."""
@@ -601,14 +610,14 @@ class Workers:
         """Give a worker no work for a while, because its host could not read a video."""
         if identity in self.members:
             self.members[identity].unreadable = unreadable
-            self._resting[identity] = now + REST_SECONDS
+            self.resting[identity] = now + REST_SECONDS
             self._changed.add(identity)
 
     def wake(self, now: float) -> None:
         """Give work again to workers whose rest is over."""
-        rested = [identity for identity, until in self._resting.items() if now >= until]
+        rested = [identity for identity, until in self.resting.items() if now >= until]
         for identity in rested:
-            del self._resting[identity]
+            del self.resting[identity]
         self._changed.update(rested)
 
     def hanging(self, now: float) -> list[bytes]:
@@ -668,7 +677,7 @@ class Workers:
             if (before := self._held.pop(identity, None)) is not None:
                 del self._room[bisect_left(self._room, (before, identity))]
             worker, held = self.members.get(identity), self._leases.held_by(identity)
-            if worker is None or worker.given_up or identity in self._resting:
+            if worker is None or worker.given_up or identity in self.resting:
                 continue
             if held < worker.credit and not self._is_alone(identity):
                 self._held[identity] = held

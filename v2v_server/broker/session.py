@@ -44,14 +44,14 @@ _QUANTUM_NS = _SECOND_NS // 20
 _MOST_DEBTS = 4096
 """Number of debts remembered for absent consumers; the oldest is dropped first."""
 
-_Place: TypeAlias = tuple[bool, int]  # (whether in debt, key among such consumers)
+_Entry: TypeAlias = tuple[bool, int]  # (whether in debt, key among such consumers)
 
 
 @dataclass(slots=True)
 class _Balance:
     turn: int
     balance_ns: int = 0  # without what a waiting debtor has earned
-    place: _Place | None = None  # None: does not wait
+    entry: _Entry | None = None  # None: does not wait
 
 
 class FairQueue:
@@ -106,12 +106,12 @@ class FairQueue:
         if account is None:
             self._remember(identity, cost_ns)
         else:
-            self._settle(identity, self.balance_ns(identity) - cost_ns, waits=account.place is not None)
+            self._settle(identity, self.balance_ns(identity) - cost_ns, waits=account.entry is not None)
 
     def balance_ns(self, identity: bytes) -> int:
         """Return what a consumer has earned and not used, nanoseconds; negative: its debt."""
         account = self._accounts[identity]
-        in_debt, key = account.place or (False, 0)
+        in_debt, key = account.entry or (False, 0)
         return self._earned_ns - key if in_debt else account.balance_ns
 
     def drop_savings(self, identity: bytes) -> None:
@@ -125,7 +125,7 @@ class FairQueue:
 
     def set_waiting(self, identity: bytes, *, waits: bool) -> None:
         """Note whether a consumer waits for a worker."""
-        if waits != (self._accounts[identity].place is not None):
+        if waits != (self._accounts[identity].entry is not None):
             self._settle(identity, self.balance_ns(identity), waits=waits)
 
     def next(self) -> bytes | None:
@@ -147,14 +147,14 @@ class FairQueue:
     def _settle(self, identity: bytes, balance_ns: int, *, waits: bool) -> None:
         """Set a balance, and move the consumer to where it belongs."""
         account = self._accounts[identity]
-        if account.place is not None:
-            in_debt, key = account.place
+        if account.entry is not None:
+            in_debt, key = account.entry
             queue = self.waiting[in_debt]
             del queue[bisect_left(queue, (key, identity))]
-        account.balance_ns, account.place = balance_ns, None
+        account.balance_ns, account.entry = balance_ns, None
         if waits:
-            account.place = (True, self._earned_ns - balance_ns) if balance_ns < 0 else (False, account.turn)
-            insort(self.waiting[account.place[0]], (account.place[1], identity))
+            account.entry = (True, self._earned_ns - balance_ns) if balance_ns < 0 else (False, account.turn)
+            insort(self.waiting[account.entry[0]], (account.entry[1], identity))
 
     def _remember(self, identity: bytes, debt_ns: int) -> None:
         self.debts_ns[identity] = self.debts_ns.pop(identity, 0) + debt_ns
@@ -339,10 +339,10 @@ class Sessions:
     def _totals_of(self, session: Session) -> ConsumerTotals:
         """Return the totals of the consumer that opens a session: those of its last one, if it left a moment ago."""
         wanted, earliest = session.display, session.since - RETURN_SECONDS
-        for place in range(len(self._departed) - 1, -1, -1):
-            display, totals = self._departed[place]
+        for number in range(len(self._departed) - 1, -1, -1):
+            display, totals = self._departed[number]
             if display == wanted and (totals.left_at or 0.0) > earliest:
-                del self._departed[place]
+                del self._departed[number]
                 totals.resume(session.since)
                 return totals
         return ConsumerTotals(next(self._numbers), session.since)
@@ -371,8 +371,8 @@ class Sessions:
             LimitExceeded: the credit would be exceeded; nothing is queued.
             IndexError: an index is outside the epoch; nothing is queued.
         """
-        places: dict[int, Slot | None] = dict(zip(indices, slots, strict=True)) if slots else dict.fromkeys(indices)
-        new = [index for index in places if (epoch, index) not in session.unanswered]
+        slot_of: dict[int, Slot | None] = dict(zip(indices, slots, strict=True)) if slots else dict.fromkeys(indices)
+        new = [index for index in slot_of if (epoch, index) not in session.unanswered]
         for index in new:
             if index >= session.schedule.count:
                 raise IndexError(f"index {index} of an epoch of {session.schedule.count} sequences")
@@ -387,7 +387,7 @@ class Sessions:
         for index in new:
             session.unanswered.add((epoch, index))
             place = session.schedule.place(index)
-            session.waiting.append(Request(session.identity, epoch, index, place=place, slot=places[index]))
+            session.waiting.append(Request(session.identity, epoch, index, place=place, slot=slot_of[index]))
         self._requeue(session)
 
     def take_waiting(self, session: Session, requests: Collection[Request]) -> None:
@@ -436,7 +436,9 @@ class Sessions:
         session = self._sessions.get(request.session)
         if session is None or session.spec.samples_per_decode == 1:
             return []
-        siblings = [other for other in session.waiting if other.clip == request.clip and not runs_alone(other)]
+        # Under another snapshot a request returns to its first candidate, and so to another clip.
+        clip, waiting = session.current(request).clip, session.waiting
+        siblings = [other for other in waiting if session.current(other).clip == clip and not runs_alone(other)]
         for sibling in siblings:
             session.waiting.remove(sibling)
         self._requeue(session)
@@ -478,7 +480,7 @@ class Sessions:
         ]
 
     def dispensable(self, now: float) -> list[bytes]:
-        """Return the sessions to forget if others need their place. A live consumer sends a message every few
+        """Return the sessions to forget if others need to connect. A live consumer sends a message every few
         seconds.
         """
         return [

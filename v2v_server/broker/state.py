@@ -1,18 +1,18 @@
-"""What the broker knows, as one value, and the actions that it wants done. The loop (:mod:`v2v_server.serve`) has the
-sockets, the processes and the disk, and does them. :mod:`v2v_server.broker.dispatcher` changes the value; all other
-parts only read. No I/O, but for the index of the corpus, which :attr:`Broker.complete` reads.
+"""What the broker knows, as one value, and the actions that it wants done. No I/O: the loop (:mod:`v2v_server.serve`)
+has the sockets, the processes and the disk, and does them. The modules of this folder change the value; all others only
+read it.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Any, TypeAlias
 
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import ProtocolError, VersionMismatch
-from v2v_protocol.messages import Denied, ErrorCode, Frames, Lease, encode
+from v2v_protocol.messages import Denied, ErrorCode, Frames, Lease, Notes, encode
 from v2v_protocol.sample import Refusal, SampleId
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import LeaseBook, Request, WorkDone, Workers
@@ -51,6 +51,35 @@ class ToWorker:
     identity: bytes
     frames: Frames
     arena: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Grant:
+    """Complete the leases of one clip with what the index on disk holds of it, and send them to a worker; or report
+    that they cannot be completed.
+
+    Attributes:
+        identity: routing id of the worker.
+        leases: without the parts that the index holds; those behind the first are its siblings.
+        spec: the spec that the leases name.
+        takes_notes: whether the worker accepts a message with notes.
+    """
+
+    identity: bytes
+    leases: tuple[Lease, ...]
+    spec: StreamSpec
+    takes_notes: bool
+
+    def messages(self, first: Lease) -> list[ToWorker]:
+        """Return the messages to the worker.
+
+        Args:
+            first: the first lease, completed; its siblings take the same parts of the index.
+        """
+        first = first if self.takes_notes else replace(first, notes=Notes())
+        parts = {name: getattr(first, name) for name in ("frame_index", "scene", "sidecars", "notes")}
+        completed = [first, *(replace(sibling, **parts) for sibling in self.leases[1:])]
+        return [ToWorker(self.identity, encode(lease), lease.arena) for lease in completed]
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,18 +158,13 @@ class SendStatus:
 
 
 Action: TypeAlias = (
-    ToConsumer | ToWorker | Disconnect | GiveUp | AddToQuarantine | CheckVideo | ReportRefusal | SendStatus
+    ToConsumer | ToWorker | Grant | Disconnect | GiveUp | AddToQuarantine | CheckVideo | ReportRefusal | SendStatus
 )
 
 
 def denial(code: ErrorCode, text: str) -> Frames:
     """Build a Denied message, shortened to fit a header."""
     return encode(Denied(code, text if len(text) <= _LONGEST_TEXT else text[:_LONGEST_TEXT] + " ..."))
-
-
-def malformed(error: ProtocolError) -> Frames:
-    """Build the reply to a message that cannot be used."""
-    return denial(ErrorCode.VERSION if isinstance(error, VersionMismatch) else ErrorCode.MALFORMED, str(error))
 
 
 @dataclass(slots=True)
@@ -262,8 +286,6 @@ class Broker:
     Attributes:
         facts: what is known of the videos, in memory.
         default_spec: the spec of a consumer that sends none.
-        complete: returns a lease with what the index on disk holds of its clip. It raises IndexUnreadable if that
-            cannot be read at the moment, and another V2VError if it never can.
         lease_deadline_seconds: a worker that is silent over one sample for longer than this, in addition to the time
             that the sample may take, is treated as hung.
         session_idle_seconds: a session that is silent for this long is dropped, even if it waits for samples. Its
@@ -282,7 +304,7 @@ class Broker:
         makers: the request that has the lease of each sample that others may follow, by sharing key.
         followers: requests that wait for the sample of a maker.
         parked: clips that the free workers do not suit, oldest first.
-        outgrown: memory that was not enough for a clip under a spec, bytes, by :func:`dispatcher.clip_key`. It lasts as
+        outgrown: memory that was not enough for a clip under a spec, bytes, by :func:`assignment.clip_key`. It lasts as
             long as the server: the next one may have larger workers.
         refusals: the last few, oldest first.
         blocked_reason: why no lease can be granted at the moment; empty if leases can be granted.
@@ -294,7 +316,6 @@ class Broker:
     facts: CorpusFacts
     default_spec: StreamSpec
     _: KW_ONLY
-    complete: Callable[[Lease, StreamSpec], Lease]
     lease_deadline_seconds: float
     max_credit_bytes: int
     quarantine: Quarantine
@@ -328,7 +349,7 @@ class Broker:
     @property
     def workers(self) -> int:
         """Return the number of workers that said hello and are alive as far as is known."""
-        return len(self.registry)
+        return len(self.registry.members)
 
     @property
     def waiting(self) -> int:
@@ -349,7 +370,7 @@ class Broker:
 
     def has_session(self, identity: bytes) -> bool:
         """Return whether a peer is a consumer with a session, or a worker that said hello."""
-        return self.sessions.get(identity) is not None or identity in self.registry
+        return self.sessions.get(identity) is not None or identity in self.registry.members
 
     def identity_of(self, request: Request) -> SampleId | None:
         """Return the identity of the sample that a request asks for; None if its consumer is gone."""
@@ -370,4 +391,12 @@ class Broker:
     @property
     def idle_share(self) -> float:
         """Share of the workers that hold no lease: 0 to 1."""
-        return max(0.0, 1.0 - len(self.leases.held) / max(len(self.registry), 1)) if self.registry else 0.0
+        return (
+            max(0.0, 1.0 - len(self.leases.held) / max(len(self.registry.members), 1)) if self.registry.members else 0.0
+        )
+
+
+def malformed(broker: Broker, error: ProtocolError) -> Frames:
+    """Count a message that cannot be used, and build the reply."""
+    broker.counters.malformed += 1
+    return denial(ErrorCode.VERSION if isinstance(error, VersionMismatch) else ErrorCode.MALFORMED, str(error))

@@ -20,7 +20,8 @@ from v2v_server.corpus.catalogue import Catalogue, index_path, list_corpus, open
 from v2v_server.corpus.index import Shard, make_folder, merge_parts, parts_in, write_part
 from v2v_server.corpus.probe import SceneCollection
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, VideoSource, open_source
-from v2v_server.store.pixels import VideosKind
+from v2v_server.corpus_words import notes_of
+from v2v_server.kinds.registry import KindFlags, kind_from
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
 
@@ -46,18 +47,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     videos.add_argument(
         "--scene", choices=SCENES, default="off", help="auto: also compute the statistics that --scene auto needs"
     )
-    names = (
-        "list",
-        "rows",
-        "videos_kind",
-        "rate",
-        "photograph_seconds",
-        "picture_bits",
-        "cache_dir",
-        "copies",
-        "copies_gib",
-    )
-    parser.add_settings(ServeConfig, *names)
+    parser.add_settings(ServeConfig, "list", "rows", "cache_dir", "copies", "copies_gib")
+    parser.add_settings(KindFlags)
     run = parser.group("Run")
     run.add_argument(
         "--workers",
@@ -95,7 +86,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def _source(arguments: argparse.Namespace) -> VideoSource:
-    kind, copies_gib = VideosKind.of(vars(arguments)), arguments.copies_gib or COPIES_GIB
+    kind, copies_gib = kind_from(vars(arguments)), arguments.copies_gib or COPIES_GIB
     options = SourceOptions(arguments.list, arguments.copies, copies_gib, arguments.cache_dir, kind)
     return open_source(arguments.videos, options)
 
@@ -116,7 +107,7 @@ def _catalogue_all(arguments: argparse.Namespace, probed: _Probed) -> Catalogue:
         cache_dir=arguments.cache_dir,
         copies=arguments.copies,
         copies_gib=arguments.copies_gib or COPIES_GIB,
-        kind=VideosKind.of(vars(arguments)),
+        kind=kind_from(vars(arguments)),
         scene=arguments.scene != "off",
         processes=arguments.workers,
         progress=probed,
@@ -137,14 +128,14 @@ def _catalogue_shard(arguments: argparse.Namespace, shard: Shard, probed: _Probe
     corpus = list_corpus(source, Rows.parse(arguments.rows or "full"), probed.notice)
     ids = [id for id in corpus.ids if shard.holds(id)]
     scenes = SceneCollection(corpus.rows) if arguments.scene != "off" else None
-    index = index_path(source.name, arguments.cache_dir, shard)
-    store, table, notes = refresh_index(source, ids, index, scenes, arguments.workers, probed, probed.notice)
+    index, refused = index_path(source.name, arguments.cache_dir, shard), dict[str, str]()
+    store, table, notes = refresh_index(source, ids, index, scenes, arguments.workers, probed, probed.notice, refused)
     store.close()
     if notes:
         raise CorpusError(notes[0])
     problems = Counter(problem for problem in table.problem if problem is not None)
-    path, usable = write_part(index, out, shard), len(ids) - problems.total()
-    lines = [f"shard {shard}: {len(ids)} of {len(corpus.ids)} videos, {usable} can be used"]
+    path, usable = write_part(index, out, shard), len(table) - problems.total()
+    lines = [f"shard {shard}: {len(ids)} of {len(corpus.ids)} videos and archives, {usable} videos can be used"]
     return [*lines, *(f"  {count}: {reason}" for reason, count in problems.most_common(_SHOWN)), f"part: {path}"]
 
 
@@ -161,7 +152,7 @@ class _Probed:
 
 def _of_all(catalogue: Catalogue) -> list[str]:
     with closing(catalogue):
-        lines = [*catalogue.notes, f"{catalogue.source}: {counted(len(catalogue.videos), 'video')} can be used"]
+        lines = [*notes_of(catalogue), f"{catalogue.source}: {counted(len(catalogue.videos), 'video')} can be used"]
         if catalogue.refusals:
             lines.append(f"{counted(len(catalogue.refusals), 'file')} cannot be used:")
             lines += [f"  {refusal}" for refusal in catalogue.refusals[:_SHOWN]]

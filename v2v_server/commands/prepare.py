@@ -22,10 +22,11 @@ from v2v_protocol.spec import SCENES
 from v2v_protocol.write_aside import JSON, write_json
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.corpus.sources.source import LIST_SUFFIXES
+from v2v_server.corpus.sources.copies import is_url
+from v2v_server.corpus.sources.listing import LIST_SUFFIXES
+from v2v_server.kinds.registry import KindFlags, kind_from
 from v2v_server.prepare import Report, check_destination, prepare
 from v2v_server.store.format import DEFAULT_SIZE, SIZES
-from v2v_server.store.pixels import VideosKind
 from v2v_server.store.planes import OPTIONAL, PLANES
 from v2v_server.system.process import usable_cores
 from v2v_server.video.rows import Rows
@@ -45,7 +46,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         "Exit status: 1 if some videos were not prepared, or lack requested statistics.",
     )  # fmt: skip
     videos = parser.group("Videos")
-    videos.add_argument("source", metavar="SRC", help="folder of videos, a video, or a list file; never written to")
+    videos.add_argument(
+        "source",
+        metavar="SRC",
+        help="folder of videos, a video, a list file, or an address in object storage; never written to",
+    )
     videos.add_argument("destination", metavar="DST", help="folder to create, or to continue after an interruption")
     videos.add_argument(
         "--scene",
@@ -53,7 +58,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         default="off",
         help="auto: also compute the statistics that v2v-serve --scene auto uses",
     )
-    parser.add_settings(ServeConfig, "list", "rows", "videos_kind", "rate", "picture_bits", "cache_dir")
+    parser.add_settings(ServeConfig, "list", "rows", "cache_dir")
+    parser.add_settings(KindFlags)
     stored = parser.group("Files")
     stored.add_argument(
         "--size", choices=tuple(SIZES), default=DEFAULT_SIZE,
@@ -83,14 +89,15 @@ def _run(arguments: argparse.Namespace) -> int:
     source = Path(arguments.source).absolute()
     single = source.is_file() and source.suffix.lower() not in LIST_SUFFIXES
     folder = source.parent if source.is_file() else source
-    check_destination(Path(arguments.destination).resolve(), folder.resolve(), single)  # probing may take hours
+    root = None if is_url(arguments.source) else folder.resolve()
+    check_destination(Path(arguments.destination).resolve(), root, single)  # probing may take hours
     with Progress("probing videos") as probing:
         catalogue = open_catalogue(
             arguments.source,
             list_file=arguments.list,
             rows=Rows.parse(arguments.rows or "full"),
             cache_dir=arguments.cache_dir,
-            kind=VideosKind.of(vars(arguments)),
+            kind=kind_from(vars(arguments)),
             processes=arguments.workers,
             progress=probing,
             notice=probing.notice,
@@ -103,7 +110,7 @@ def _run(arguments: argparse.Namespace) -> int:
             processes=arguments.workers,
             scene=arguments.scene != "off",
             planes=tuple(dict.fromkeys(arguments.planes)),
-            single=_is_video(Path(arguments.source), catalogue.folder),
+            single=root is not None and _is_video(Path(arguments.source), catalogue.folder),
             progress=lambda done, total, made, expected: shown(done, total, _size(made, expected)),
         )
     for line in summary(report, arguments.size, time.monotonic() - started):

@@ -13,6 +13,7 @@ from v2v_protocol.errors import V2VError
 from v2v_protocol.spec_flags import add_spec, asked_recipe, recipe_setting
 from v2v_protocol.write_aside import check_output, check_outside
 from v2v_server.config import SERVE_KEYS, ServeConfig
+from v2v_server.kinds.registry import KindFlags
 from v2v_server.supervise.local_host import start_ahead
 from v2v_server.system.log import report_errors
 
@@ -30,6 +31,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "Exit status: 0 ended by SIGTERM, 130 by Ctrl-C; a second signal ends it at once, without a summary.",
     )  # fmt: skip
     parser.add_settings(ServeConfig)
+    parser.add_settings(KindFlags)
     add_spec(parser)
     parser.group("Videos").add_argument("--config", metavar="FILE", help="YAML file of these flags; a flag wins")
     return run_command(parser, report_errors(_run), argv, failures=(V2VError,), interrupted="")

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import V2VError
+from v2v_protocol.keys import addresses
 from v2v_protocol.programs import environment
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.sources.source import COPIES_GIB, SourceOptions, open_source
@@ -34,11 +35,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         if argv == [""]:
             return 0
     parser = Parser(
-        "v2v-worker", "--connect ADDRESS --videos DIR [flags]", "Work for a server: take leases, make samples.",
-        ["v2v-worker --connect tcp://10.0.0.5:5556 --videos /data/webvid"],
+        "v2v-worker", "--connect ADDRESS --videos DIR [flags]", "Work for servers: take leases, make samples.",
+        [
+            "v2v-worker --connect tcp://10.0.0.5:5556 --videos /data/webvid",
+            "v2v-worker --connect tcp://a:5556,tcp://b:5556 --videos /data/webvid",
+        ],
     )  # fmt: skip
     work = parser.group("Work")
-    work.add_argument("--connect", required=True, metavar="ADDRESS", help="where the server listens for workers")
+    work.add_argument(
+        "--connect", required=True, metavar="ADDRESS",
+        help="where the server listens for workers; several, separated by commas, are served in turns",
+    )  # fmt: skip
     work.add_argument(
         "--videos", required=True, metavar="DIR", help="the corpus on this host, the same as the server's, or s3://..."
     )
@@ -76,7 +83,8 @@ def _run(arguments: argparse.Namespace, argv: Sequence[str]) -> None:
     source = open_source(
         arguments.videos, SourceOptions(copies=arguments.copies, copies_gib=arguments.copies_gib or COPIES_GIB)
     )
-    source.make()
+    if source.copies is not None:
+        source.copies.make()
     cache = None
     if arguments.cache is not None:
         folder = Path(arguments.cache)
@@ -85,8 +93,8 @@ def _run(arguments: argparse.Namespace, argv: Sequence[str]) -> None:
         cache = Cache(folder, int((100.0 if arguments.cache_gib is None else arguments.cache_gib) * GIB))
     log = Log(is_json=arguments.log_format == "json")
     run_worker(
-        arguments.connect, source, name, arguments.parent_pid, arguments.logbook_fd, cache, arguments.keys, log,
-        arguments.arenas_fd, insecure=arguments.insecure,
+        addresses(arguments.connect), source, name, arguments.parent_pid, arguments.logbook_fd, cache, arguments.keys,
+        log, arguments.arenas_fd, insecure=arguments.insecure,
     )  # fmt: skip
 
 

@@ -10,8 +10,8 @@ import hashlib
 import os
 import sqlite3
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby
@@ -22,11 +22,10 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, VideoChanged
 from v2v_protocol.messages import Lease
-from v2v_protocol.programs import counted
 from v2v_protocol.sample import ARRAYS, Refusal, RefusalKind, sidecar_endings
 from v2v_protocol.spec import StreamSpec
-from v2v_recordings.time_stamps import PLAUSIBLE_HZ
 from v2v_server.corpus.index import SCHEMA_VERSION, FigureKind, Shard, Store
+from v2v_server.corpus.members import list_members
 from v2v_server.corpus.probe import (
     SceneCollection,
     VideoProgress,
@@ -37,35 +36,41 @@ from v2v_server.corpus.probe import (
     sidecar_kind,
 )
 from v2v_server.corpus.scenes.scene import Scene
-from v2v_server.corpus.sources.prepared import ABSENT, Header
+from v2v_server.corpus.sources.listing import (
+    ListEntry,
+    Notice,
+    by_parts,
+    format_problems,
+    is_said,
+    left_out_note,
+    silent,
+)
+from v2v_server.corpus.sources.prepared import ABSENT, Header, Manifest, manifest_of, rows_of
+from v2v_server.corpus.sources.sidecars import sidecar_id
 from v2v_server.corpus.sources.source import (
     COPIES_GIB,
     GONE,
     FileState,
-    ListEntry,
-    Notice,
     SourceOptions,
     VideoSource,
-    by_parts,
-    is_said,
-    left_out_note,
     open_source,
-    sidecar_id,
-    silent,
+    unmarked,
 )
 from v2v_server.corpus.videos import (
     NO_THRESHOLDS,
     CorpusFacts,
+    IndexRow,
     Sidecars,
     Thresholds,
+    VideoEntry,
     Videos,
     VideoTable,
     joined,
     missing_arrays,
-    unknown_arrays,
 )
+from v2v_server.kinds.kind import VideosKind
+from v2v_server.kinds.registry import VIDEOS, kind_of
 from v2v_server.store.format import PIECE_FRAMES
-from v2v_server.store.pixels import VIDEOS, VideosKind, kind_of
 from v2v_server.store.store_file import STORE_FORMAT
 from v2v_server.system.log import gauge, text
 from v2v_server.system.process import cache_folder, without_collections
@@ -73,6 +78,7 @@ from v2v_server.video.fingerprint import CHANGED
 from v2v_server.video.frame_index import FrameIndex, unseekable
 from v2v_server.video.rows import Rows
 
+_NO_FILE = "its file is missing or changed"
 _KEPT_SLICES = 64
 _KEPT_LONG_FRAMES = 1 << 22
 """Frames of the opened indexes that are kept, 32 MiB: two days at 25 a second; one index at least."""
@@ -89,7 +95,7 @@ class Corpus:
     Attributes:
         source: where the videos come from.
         rows: which rows of the pictures may be used.
-        ids: of the files that may be videos.
+        ids: of the files that may be videos, and of archives that may hold some.
         refused: files, folders and lines of the list that give no video, by id, with reasons.
         left_out: reports files of other endings; "" if there are none.
     """
@@ -112,9 +118,10 @@ def list_corpus(source: VideoSource, rows: Rows | None, notice: Notice) -> Corpu
         CorpusError: the source cannot be listed, makes no sense, or has no video; or its folder of copies cannot be
             written to.
     """
-    source.make()
-    rows = source.rows(rows)
-    source.rates = {entry.id: entry.rate for entry in source.listed or () if entry.rate is not None}
+    if source.copies is not None:
+        source.copies.make()
+    rows = rows_of(source, rows)
+    source.rates = {entry.id: entry.rate for entry in source.listed() or () if entry.rate is not None}
     refused: dict[str, str] = {}
     left_out = Counter[str]()
     ids = list[str]()
@@ -123,22 +130,15 @@ def list_corpus(source: VideoSource, rows: Rows | None, notice: Notice) -> Corpu
             ids.append(id)
         if is_said(len(ids)):
             notice(f"looking for videos in {source}: {len(ids)} so far")
-    note = left_out_note(left_out)
+    note = left_out_note(left_out, has_videos=bool(ids))
     if not ids:
-        raise CorpusError(
-            f"{source}: no video found; looked for {source.kind.form.LOOKED_FOR}"
-            f"{format_problems(refused)}{note and '. '}{note}"
-        )
+        raise _no_video(source, refused, note)
     return Corpus(source, rows, tuple(ids), refused, note)
 
 
-def format_problems(problems: Mapping[str, str]) -> str:
-    """Return the first few reasons, for an error message; "" without one."""
-    if not problems:
-        return ""
-    shown = "; ".join(f"{id}: {problems[id]}" for id in sorted(problems)[:3])
-    more = f"; and {len(problems) - 3} more" if len(problems) > 3 else ""
-    return f" ({shown}{more})"
+def _no_video(source: VideoSource, refused: Mapping[str, str], note: str = "") -> CorpusError:
+    looked_for, problems = source.kind.looked_for, format_problems(refused)
+    return CorpusError(f"{source}: no video found; looked for {looked_for}{problems}{note and '. '}{note}")
 
 
 def index_path(
@@ -166,6 +166,7 @@ def refresh_index(
     processes: int,
     progress: VideoProgress,
     notice: Notice,
+    refused: dict[str, str],
 ) -> tuple[Store, VideoTable, list[str]]:
     """Return an open index that knows every id, its table, and notes for the user.
 
@@ -173,14 +174,16 @@ def refresh_index(
 
     Args:
         source: where the videos come from.
-        ids: of the videos to know.
+        ids: of the videos to know, and of archives of them.
         path: of the index.
         scenes: how to analyse what the videos show; None does not.
         processes, progress, notice: as in :func:`v2v_server.corpus.catalogue.open_catalogue`.
+        refused: receives, by id, why an archive or a member is refused.
+
     """
     ids = [id for id, _ in groupby(sorted(ids))]  # a list may name a video twice
     try:
-        store, table = _refreshed(path, source, ids, scenes, processes, progress, notice)
+        store, table = _refreshed(path, source, ids, scenes, processes, progress, notice, refused)
     except (sqlite3.Error, OSError, UnicodeDecodeError) as error:
         note = (
             f"the catalogue's index {path} cannot be used ({error}); this start keeps it in memory, and the next one "
@@ -189,7 +192,7 @@ def refresh_index(
         )
         if "locked" in str(error):  # the outcome of a wait that was said
             notice(f"the catalogue's index {path} cannot be used ({error}): probing every video again", is_urgent=True)
-        return *_refreshed(None, source, ids, scenes, processes, progress, notice), [note]
+        return *_refreshed(None, source, ids, scenes, processes, progress, notice, refused), [note]
     if store.replaced_version is None:
         return store, table, []
     note = (
@@ -207,9 +210,11 @@ def _refreshed(
     processes: int,
     progress: VideoProgress,
     notice: Notice,
+    refused: dict[str, str],
 ) -> tuple[Store, VideoTable]:
     store = Store(path, notice)
     try:
+        ids = sorted(list_members(source, store, ids, processes, notice, refused))
         kind = None if scenes is None else scenes.kind
         if kind is not None:
             store.make_figures()
@@ -278,13 +283,18 @@ class Catalogue:
         rows: which rows of the pictures may be used.
         videos: the videos that can be used, by id.
         refusals: files, folders and lines of the list that give no video, by id.
-        notes: what the user ought to be told: an index that cannot be kept, counts that contradict the list.
+        notes: what the user ought to be told of opening it, such as an index that cannot be kept. What is wrong with
+            the videos is worded in :mod:`v2v_server.corpus_words`.
         digest: 32 hexadecimal digits that name this snapshot: equal digests, equal videos.
         prepared: how the folder was made if it is a prepared one (see :mod:`v2v_server.prepare`). Its videos
             are those of its source in number, order, id and frames, so that every position means the same frames;
             one without a sound prepared file is refused when it is opened, like a damaged one.
         scene_digest: names this snapshot together with the statistics of its videos; None without them.
         sidecars: the files beside the videos that arrays can be made from, by ending.
+        lacking: why videos of a prepared folder have no file, by id.
+        shorter: how videos are shorter than a list states.
+        crashing: ids of the videos that crash the decoder that analyses scenes.
+        left_out: reports files of other endings; "" if there are none.
     """
 
     source: VideoSource
@@ -296,8 +306,11 @@ class Catalogue:
     prepared: Header | None
     scene_digest: str | None
     sidecars: Mapping[str, Sidecars]
+    lacking: Mapping[str, str]
+    shorter: Sequence[str]
+    crashing: Sequence[str]
+    left_out: str
     _store: Store = field(repr=False, compare=False)
-    _absent: frozenset[str] = field(repr=False, compare=False)  # without a prepared file
     _scenes: SceneCollection | None = field(repr=False, compare=False)
     _unknown: frozenset[str] = field(repr=False, compare=False)
     _slices: dict[tuple[str, int, int], bytes] = field(repr=False, compare=False, default_factory=dict)
@@ -305,17 +318,36 @@ class Catalogue:
 
     @property
     def folder(self) -> Path:
-        """Return the folder that ids are relative to, see :attr:`VideoSource.folder`."""
+        """Return the folder that ids are relative to.
+
+        Raises:
+            CorpusError: there is no such folder on this host.
+        """
+        if self.source.folder is None:
+            raise CorpusError(f"{self.source}: not a folder of this host; copy the videos to one first")
         return self.source.folder
 
     def path(self, id: str) -> Path:
-        """Return where the video lies.
+        """Return where the video lies; of a member of an archive, what a FileRange is as a path.
 
         Raises:
             CorpusError: there is no such id in this catalogue, or no such folder on this host.
         """
-        self._fingerprint(id)
-        return self.folder / self.source.file_of(id)
+        self._expect(id)
+        self.folder  # noqa: B018 - raises where there is none
+        with self.source.open_local(id, "") as path:
+            return Path(os.fspath(path))
+
+    @contextmanager
+    def lend(self, video: VideoEntry) -> Iterator[Path]:
+        """Lend the file of a video, or its copy on this host, until the end of the context.
+
+        Raises:
+            VideoUnreadable, VideoChanged: see :meth:`VideoSource.open_local`.
+        """
+        self._expect(video.id)
+        with self.source.open_local(video.id, video.fingerprint) as path:
+            yield Path(os.fspath(path))
 
     def check(self, id: str, fingerprint: str, sidecar: str = "") -> None:
         """Check that the video is as catalogued, or its sidecar of that ending, see :meth:`VideoSource.verify`.
@@ -334,8 +366,15 @@ class Catalogue:
         Raises:
             VideoChanged, VideoUnreadable: they are not the catalogued ones, or cannot be told.
         """
-        if self.source.is_local and self.source.state(id) != self.state(id):
+        known = self._expect(id)
+        if self.source.is_local and self.source.state(id) != known:
             raise VideoChanged(id, None, CHANGED)
+
+    def _expect(self, id: str) -> FileState | None:
+        """Tell the source in which state a video was catalogued, and return the state."""
+        state = self.state(id)
+        self.source.expected = id, unmarked(self.source, id, state) if state else ()
+        return state
 
     def state(self, id: str) -> FileState | None:
         """Return the state in which a video was catalogued; None if the index cannot tell.
@@ -394,7 +433,7 @@ class Catalogue:
         return index
 
     def _stored_index(self, id: str) -> bytes:
-        if id in self._absent:
+        if id in self.lacking:
             frames, height_px, width_px = self.videos.shape(id)
             return unseekable(frames, (1, 1), height_px, width_px).to_bytes()
         return self._stored(id, partial(self._store.frame_index, id))
@@ -439,13 +478,13 @@ class Catalogue:
     @property
     def facts(self) -> CorpusFacts:
         """What is known in memory: all that a server's dispatcher needs."""
-        ids = self.videos.ids if not self._absent else [id for id in self.videos.ids if id not in self._absent]
-        missing = unknown_arrays(self.kind) | ({} if self.prepared is None else missing_arrays(self.source, ids))
+        ids = self.videos.ids if not self.lacking else [id for id in self.videos.ids if id not in self.lacking]
+        missing = {**self.kind.cannot()} | ({} if self.prepared is None else missing_arrays(self.source, ids))
         return CorpusFacts(self.videos, self.rows, self.digest, self.scene_digest, self.sidecars, missing)
 
     @property
-    def kind(self) -> str:
-        """Return what its videos are, one of :data:`v2v_server.store.pixels.PIXEL_KINDS`."""
+    def kind(self) -> VideosKind:
+        """Return what its videos are, with all flags at their defaults; prepared ones are what their sources were."""
         return kind_of(self.videos.ids[0])
 
     def part(self) -> CorpusPart:
@@ -467,7 +506,8 @@ class Catalogue:
     def close(self) -> None:
         """Close the index; ``frame_index`` and ``scene`` fail afterwards."""
         self._store.close()
-        self.source.release()
+        if self.source.copies is not None:
+            self.source.copies.release()
 
     def _fingerprint(self, id: str) -> str:
         number = self.videos.find(id)
@@ -508,7 +548,7 @@ def complete_lease(lease: Lease, catalogue: Catalogue, spec: StreamSpec) -> Leas
     frames = catalogue.frame_index_bytes(video, start, count)
     state = catalogue.state(video)
     # A message has no number below 0, such as a time before 1970.
-    known = catalogue.source.unmarked(video, state) if state is not None and min(state) >= 0 else ()
+    known = unmarked(catalogue.source, video, state) if state is not None and min(state) >= 0 else ()
     notes = replace(lease.notes, state=known)
     return replace(lease, frame_index=frames, scene=part, sidecars=sidecars, notes=notes)
 
@@ -548,18 +588,22 @@ def open_catalogue(
     Raises:
         CorpusError: the folder or list is missing, unreadable or malformed, or has no usable video.
         IndexUnreadable: the index cannot be read any more after the probes.
-        UsageError: ``scene``, and the videos are photographs.
+        UsageError: ``scene``, and the videos are of a kind without scenes.
     """
-    if scene and kind.is_rendered:
-        raise UsageError("--scene auto leaves out defects of videos, which photographs do not have: set it to off")
+    if scene and not kind.has_scenes:
+        raise UsageError(f"--scene auto leaves out defects of videos, which {kind.name} do not have: set it to off")
     opened = open_source(source, SourceOptions(list_file, copies, copies_gib, cache_dir, kind))
     corpus = list_corpus(opened, rows, notice)
     scenes = SceneCollection(corpus.rows) if scene else None
     path = index_path(opened.name, cache_dir)
-    store, table, notes = refresh_index(opened, corpus.ids, path, scenes, processes, progress, notice)
+    refused = dict(corpus.refused)
+    store, table, notes = refresh_index(opened, corpus.ids, path, scenes, processes, progress, notice, refused)
+    corpus = replace(corpus, refused=refused)
     try:
         with without_collections():
-            return _snapshot(corpus, table, notes, store, scenes, processes, notice)
+            catalogue = _snapshot(corpus, table, notes, store, scenes, processes, notice)
+        opened.members, opened.tables = {}, {}  # from now on the index has their states
+        return catalogue
     except BaseException as error:
         store.close()
         if isinstance(error, sqlite3.Error):
@@ -576,10 +620,10 @@ def _snapshot(
     processes: int,
     notice: Notice,
 ) -> Catalogue:
-    source, manifest, table = corpus.source, corpus.source.manifest, on_disk
+    source, manifest, table = corpus.source, manifest_of(corpus.source), on_disk
     problems, absent = dict(corpus.refused), frozenset[str]()
     if manifest is not None:
-        rows = ((*manifest.as_source(on_disk.row(at)).columns, None) for at in range(len(on_disk)))
+        rows = ((*_as_source(manifest, on_disk.row(at)).columns, None) for at in range(len(on_disk)))
         table = replace(VideoTable.read(rows, len(on_disk))[0], summaries=on_disk.summaries)
         absent = frozenset(table.ids[at] for at in np.flatnonzero(table.codec == ABSENT).tolist())
     else:
@@ -587,59 +631,21 @@ def _snapshot(
     usable = table.problem == np.array(None)
     problems.update((table.ids[at], table.problem[at]) for at in np.flatnonzero(~usable).tolist())
     table = table.where(usable)
-    thresholds, shorter = _listed(source.listed or (), Videos(table, {}))
+    thresholds, shorter = _listed(source.listed() or (), Videos(table, {}))
     videos = Videos(table, thresholds)
+    if not videos and not len(on_disk):
+        raise _no_video(source, problems, corpus.left_out)
     if not videos:
         raise CorpusError(f"{source}: none of {len(problems)} videos can be used{format_problems(problems)}")
-    if manifest is not None and absent:
-        if len(absent) == len(videos):
-            raise CorpusError(f"{source}: none of {len(absent)} prepared files is there as its manifest says")
-        reasons = {id: manifest.videos[id].problem or "its file is missing or changed" for id in absent}
-        notes = [
-            *notes,
-            f"{counted(len(absent), 'video has', 'videos have')} no prepared file, so others stand in for them"
-            f"{format_problems(reasons)}",
-        ]
-    if len(woven := np.flatnonzero(videos.interlaced)):
-        first = videos[int(woven[0])].id
-        notes = [
-            *notes,
-            f"{counted(len(woven), 'video is', 'videos are')} interlaced ({first}): the frames are served as they are "
-            "stored, two fields taken at different times woven together, so that what moves is combed and makes "
-            "false events. Deinterlace such videos once (ffmpeg -i IN -vf bwdif=send_field OUT), or leave them out",
-        ]
-    if remarks := {videos.ids[at]: videos.remark[at] for at in np.flatnonzero(videos.remark).tolist()}:
-        notes = [
-            *notes,
-            f"{counted(len(remarks), 'video is', 'videos are')} served in part, or with wrong grey levels or times"
-            f"{format_problems(remarks)}",
-        ]
-    rates, (low, high) = videos.frames_per_second, PLAUSIBLE_HZ
-    is_odd = (rates > 0) & ((rates < low) | (rates > high))
-    if odd := {videos.ids[at]: f"{rates[at]:.3g}" for at in np.flatnonzero(is_odd).tolist()}:
-        notes = [
-            *notes,
-            f"{counted(len(odd), 'video has a rate', 'videos have rates')} outside of {low:g} to {high:g} frames a "
-            f"second{format_problems(odd)}: check the unit of their time stamps, or --rate",
-        ]
-    if corpus.left_out:
-        notes = [*notes, corpus.left_out]
-    if shorter:
-        notes = [
-            *notes,
-            f"{counted(len(shorter), 'video is', 'videos are')} shorter than the list states: {shorter[0]}",
-        ]
+    lacking = {} if manifest is None else {id: manifest.videos[id].problem or _NO_FILE for id in sorted(absent)}
+    if lacking and len(lacking) == len(videos):
+        raise CorpusError(f"{source}: none of {len(absent)} prepared files is there as its manifest says")
     digest = videos.digest(corpus.rows)
     scene_digest, unknown = None, set(absent)
     if scenes is not None:
         split, scene_digest = scenes.read(store, table, unknown, digest)
         videos = Videos(table, thresholds, split)
-        if died := sorted(unknown - absent):
-            notes = [
-                *notes,
-                f"{counted(len(died), 'video crashes', 'videos crash')} the decoder that analyses scenes: {died[0]}",
-            ]
-    marks = {} if source.kind.is_rendered else dict(zip(videos.ids, videos.fingerprints, strict=True))
+    marks = dict(zip(videos.ids, videos.fingerprints, strict=True)) if source.kind.has_sidecars else {}
     endings = sidecar_endings(tuple(ARRAYS))
     sidecars, said = collect_sidecars(source, store, marks, videos.shape, endings, processes, notice)
     notes = [*notes, *said]
@@ -653,10 +659,35 @@ def _snapshot(
         prepared=None if manifest is None else manifest.header,
         scene_digest=scene_digest,
         sidecars=sidecars,
+        lacking=lacking,
+        shorter=shorter,
+        crashing=sorted(unknown - absent),
+        left_out=corpus.left_out,
         _store=store,
-        _absent=absent,
         _scenes=scenes,
         _unknown=frozenset(unknown),
+    )
+
+
+def _as_source(manifest: Manifest, record: IndexRow) -> IndexRow:
+    """Return the record of a prepared file with the facts that have to agree with its source.
+
+    This includes videos without a usable file, whose codec is ABSENT: the sequences of the others keep their places
+    only if the source's frames are counted. A usable file may be damaged: each of its blocks is checked when it is
+    read. The source itself will do in its place.
+    """
+    video = manifest.videos[record.id]
+    is_there = record.problem is None and record.fingerprint == video.source_fingerprint
+    return replace(
+        record,
+        fingerprint=video.source_fingerprint,
+        frames=video.frames,
+        height_px=video.height_px,
+        width_px=video.width_px,
+        frames_per_second=video.frames_per_second,
+        codec=record.codec if is_there else ABSENT,
+        remark=video.remark,
+        problem=None,
     )
 
 

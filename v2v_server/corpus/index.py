@@ -14,6 +14,7 @@ import re
 import shutil
 import sqlite3
 import time
+import weakref
 from collections.abc import Generator, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -24,9 +25,9 @@ from typing import Any
 import xxhash
 
 from v2v_protocol.errors import CorpusError, UsageError
-from v2v_protocol.persisted import Int64, Persisted
 from v2v_protocol.write_aside import write_aside_and_rename
-from v2v_server.corpus.sources.source import Notice, silent
+from v2v_server.corpus.sources.listing import Notice, silent
+from v2v_server.corpus.videos import IndexRow
 from v2v_server.system.process import make_private
 
 SCHEMA_VERSION = 7
@@ -97,42 +98,6 @@ class Figures:
     data: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class IndexRow(Persisted):
-    """What is known of one file.
-
-    Attributes:
-        id: relative POSIX path.
-        size_bytes, mtime_ns, ctime_ns: of the file when it was probed; a size of -1, which no file has, lets it be
-            probed again at the next start.
-        fingerprint: see :mod:`v2v_server.video.fingerprint`.
-        frames, width_px, height_px, frames_per_second, codec, interlaced, remark: see
-            :class:`v2v_server.video.probe.VideoFacts`; frames_per_second is None where unknown.
-        problem: why the file cannot be used; None if it can.
-        frame_index: ``FrameIndex.to_bytes()``; None with a problem, and where only the other columns were read.
-    """
-
-    id: str
-    size_bytes: Int64
-    mtime_ns: Int64 = 0
-    ctime_ns: Int64 = 0
-    fingerprint: str = ""
-    frames: Int64 = 0
-    width_px: Int64 = 0
-    height_px: Int64 = 0
-    frames_per_second: float | None = None
-    codec: str = ""
-    interlaced: bool = False
-    problem: str | None = None
-    remark: str = ""
-    frame_index: bytes | None = None
-
-    @property
-    def columns(self) -> tuple[Any, ...]:
-        """Return the attributes without the frame index."""
-        return tuple(getattr(self, name) for name in _COLUMNS)
-
-
 _COLUMNS = IndexRow.__slots__[:-1]
 
 
@@ -167,6 +132,7 @@ class Store:
         self._database = sqlite3.connect(
             ":memory:" if path is None else path, timeout=_BUSY_SECONDS, isolation_level=None, check_same_thread=False
         )
+        weakref.finalize(self, self._database.close)  # commands that end with their catalogue open
         try:
             self._prepare()
         except BaseException:

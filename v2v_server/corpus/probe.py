@@ -29,21 +29,16 @@ import xxhash
 from v2v_protocol.errors import UsageError, VideoError, VideoUnreadable
 from v2v_protocol.persisted import Persisted
 from v2v_protocol.programs import counted, printable
-from v2v_server.corpus.index import FigureKind, Figures, IndexRow, Store
+from v2v_server.corpus.index import FigureKind, Figures, Store
 from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION, MOST_ANALYSED_FRAMES, PIECE, Scene
-from v2v_server.corpus.sources.prepared import Manifest
-from v2v_server.corpus.sources.source import (
-    Notice,
-    VideoSource,
-    by_parts,
-    files_between,
-    open_sidecar,
-    read_files,
-    sidecar_id,
-)
-from v2v_server.corpus.videos import Sidecars, SplitVideos, VideoTable, encoded_pieces, joined
+from v2v_server.corpus.sources.listing import Notice, by_parts
+from v2v_server.corpus.sources.prepared import Manifest, manifest_of
+from v2v_server.corpus.sources.sidecars import files_between, open_sidecar, read_files, sidecar_id
+from v2v_server.corpus.sources.source import VideoSource, rate_of
+from v2v_server.corpus.videos import IndexRow, Sidecars, SplitVideos, VideoTable, encoded_pieces, joined
+from v2v_server.kinds.kind import VideosKind
+from v2v_server.kinds.registry import VIDEOS, kind_of
 from v2v_server.labels import check_labels
-from v2v_server.store.pixels import kind_of, open_pixels
 from v2v_server.system.compile_cache import compile_cache
 from v2v_server.system.isolate import Died, run_isolated, run_twice
 from v2v_server.video.decode import ClipRequest, Cut
@@ -60,33 +55,36 @@ LARGEST_PROBE_BYTES = 2 << 30
 """Memory that a process may allocate to probe a file: enough for 16 pictures of the largest size, or a list of 2**24
 frames. A file of some kB can claim a thousand million frames, for which a demuxer would allocate memory."""
 
-_QUESTIONED_BITS = 14
-"""Pictures of 16 bits that need no more than these are questioned."""
 _MOST_TOGETHER = 1024
 _MOST_SECONDS = 10.0
 VideoProgress = Callable[[int, int], None]
 """(files done so far, files to do)."""
-ProbeFile = Callable[[VideoSource, str], IndexRow]
-"""(source, id) -> what is known of that file; see :func:`probe_file`."""
+ProbeJob = tuple[str, tuple[int, ...]]
+"""Id of a video, and the state of a member of an archive; empty for a file."""
+ProbeFile = Callable[[VideoSource, ProbeJob], IndexRow]
+"""(source, job) -> what is known of that file; see :func:`probe_file`."""
 T = TypeVar("T")
 
 
-def probe_file(source: VideoSource, id: str) -> IndexRow:
+def probe_file(source: VideoSource, job: ProbeJob) -> IndexRow:
     """Probe one file; an error becomes the record's ``problem``.
 
     A file that cannot be read gets the size -1, which no file has: it is probed again at the next start.
     """
-    if kind_of(id) == "photographs" and not source.kind.is_rendered:
-        return IndexRow(id, -1, problem="is a picture: add --videos-kind photographs")
+    id, kind = job[0], source.kind
+    owner, source.expected = kind_of(id), job if job[1] else ("", ())
+    if owner.unprepared and owner.name != kind.name:  # what can be prepared may be a store, which needs no flag
+        return IndexRow(id, -1, problem=f"is {owner.help}: add --videos-kind {owner.name}")
     try:
         before = source.state(id)
         with source.open_local(id, "") as path:
             mark = fingerprint(path)
-            facts = _timed(_levelled(_facts(path, source.kind.videos_kind), source.kind.picture_bits), source, id)
+            facts = kind.with_flags(_facts(path, kind), rate_of(source, id))
         name = facts.made_of or (f"{mark}-{facts.content}" if facts.content else mark)
         if source.state(id) != before:
             return IndexRow(id, -1, problem="changes while it is read; the next start tries again")
-        source.keep_as(id, mark, name)
+        if source.copies is not None:
+            source.copies.keep_as(id, mark, name)
     except OSError as error:
         return IndexRow(id, -1, problem=f"cannot be read: {error.strerror or error}")
     except VideoUnreadable as error:
@@ -111,45 +109,13 @@ def probe_file(source: VideoSource, id: str) -> IndexRow:
     )
 
 
-def facts_of(path: Path, kind: str = "videos") -> VideoFacts:
+def facts_of(path: Path, kind: VideosKind = VIDEOS) -> VideoFacts:
     """Return what is known of the video in a file. Errors: :class:`v2v_server.store.pixels.Pixels`."""
-    with open_pixels(path, kind) as pixels:
+    with kind.open_pixels(path) as pixels:
         return pixels.facts()
 
 
-def _timed(facts: VideoFacts, source: VideoSource, id: str) -> VideoFacts:
-    """Return the facts of pictures that follow each other at a rate that the user states, if they state no times; those
-    of a photograph, of all frames that it is shown for.
-    """
-    rate, frames = source.rate(id), source.kind.frames if source.kind.is_rendered else facts.frames
-    if not rate or facts.index.seekable:
-        return facts
-    index = facts.index.timed(np.rint(np.arange(frames) * 1e9 / rate).astype(np.int64))
-    content = f"{facts.content}@{rate:g}"
-    return replace(facts, frames=frames, frames_per_second=rate, index=index, content=content)
-
-
-def _levelled(facts: VideoFacts, bits: int) -> VideoFacts:
-    """Return the facts of pictures of 16 bits that hold fewer, if the user states it; otherwise ask whether they do.
-
-    Raises:
-        VideoError: they hold more.
-    """
-    highest, remark = facts.highest_level, ""
-    if bits and highest >> bits > 0:
-        raise VideoError("", None, f"has a level of {highest}, beyond those of --picture-bits {bits}")
-    if bits and highest >= 0:
-        return replace(facts, index=replace(facts.index, bits=bits), content=f"{facts.content}~{bits}")
-    if bits and not facts.made_of:
-        remark = f"--picture-bits {bits} does not apply: its pictures do not have 16 bits"
-    elif 0 <= highest < 1 << _QUESTIONED_BITS:
-        least = max(8, highest.bit_length())
-        remark = f"no level above {highest} of 65535 in the pictures looked at: if they hold {least} bits, they are "
-        remark += f"{1 << 16 - least} times too dark, and --picture-bits {least} stretches them"
-    return replace(facts, remark="; ".join(filter(None, (facts.remark, remark))))
-
-
-def _facts(path: Path, kind: str) -> VideoFacts:
+def _facts(path: Path, kind: VideosKind) -> VideoFacts:
     """Return what is known of the video; retry once after an error of the system rather than of the decoder.
 
     Raises:
@@ -187,13 +153,13 @@ def probe_files(
     """
     results = run_twice(
         partial(probe, source),
-        ids,
+        ((id, source.members.get(id, ())) for id in ids),
         processes,
-        deadline_seconds=lambda id: longest_seconds,
+        deadline_seconds=lambda job: longest_seconds,
         memory_bytes=LARGEST_PROBE_BYTES,
         writable=() if source.is_local else None,  # copies are fetched: from a network, into a folder
     )
-    for id, found in results:
+    for (id, _), found in results:
         yield _culprit(source, id, found) if isinstance(found, Died) else replace(found, id=id)
 
 
@@ -204,10 +170,8 @@ def _culprit(source: VideoSource, id: str, death: Died) -> IndexRow:
         why = f"could not be probed: the process ended over it twice ({death.how}), which says nothing of the file"
         return IndexRow(id, -1, problem=f"{why}; the next start tries again")
     why = f"crashes the decoder: the process that probed it died ({death.how})"
-    try:
-        return IndexRow(id, *source.state(id), problem=why)
-    except VideoUnreadable:
-        return IndexRow(id, -1, problem=why)  # gone meanwhile; if it comes back, it is probed again
+    size, modified, changed = source.states([id])  # none of a file that is gone: if it comes back, it is probed again
+    return IndexRow(id, size, modified, changed, problem=why)
 
 
 def batches(
@@ -318,10 +282,10 @@ class SceneCollection:
     def _found(
         self, store: Store, source: VideoSource, table: VideoTable, missing: list[int], processes: int
     ) -> Generator[tuple[IndexRow | _SceneJob, Scene], None, None]:
-        left = []
+        left, manifest = [], manifest_of(source)
         for place in missing:
             record = table.row(place)
-            if (data := self._stated(source.manifest, record)) is None:
+            if (data := self._stated(manifest, record)) is None:
                 left.append(place)
             else:
                 yield record, Scene.from_bytes(data)
@@ -329,7 +293,8 @@ class SceneCollection:
         def jobs() -> Iterator[_SceneJob]:
             for record in map(table.row, left):
                 index = store.frame_index(record.id, record.fingerprint) or b""
-                yield _SceneJob(record.id, record.fingerprint, record.frames, index, self._window(record))
+                place = source.members.get(record.id, ())
+                yield _SceneJob(record.id, record.fingerprint, record.frames, index, self._window(record), place)
 
         results = run_twice(
             partial(_analyse, source),
@@ -374,6 +339,7 @@ class _SceneJob(Persisted):
     frames: int
     index: bytes
     window: PixelRect | None
+    place: tuple[int, ...]
 
 
 def _analyse(source: VideoSource, job: _SceneJob) -> Scene | None:
@@ -384,7 +350,7 @@ def _analyse(source: VideoSource, job: _SceneJob) -> Scene | None:
     # Import lazily: processes that only open a catalogue need no OpenCV.
     from v2v_server.corpus.scenes.analysis import SceneAnalysis
 
-    analysis = SceneAnalysis()
+    analysis, source.expected = SceneAnalysis(), (job.id, job.place) if job.place else ("", ())
     if job.index and job.window is not None:
         try:
             with source.open_pixels(job.id, job.fingerprint) as pixels:

@@ -20,12 +20,11 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError, VideoError
-from v2v_protocol.persisted import FloatOrNaN, Persisted
+from v2v_protocol.persisted import FloatOrNaN, Int64, Persisted
 from v2v_protocol.sample import ARRAYS, sidecar_endings
-from v2v_server.corpus.index import IndexRow
 from v2v_server.corpus.scenes.scene import PIECE, Pieces, clip_pieces, firsts_of, sides_of
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.store.pixels import kind_of
+from v2v_server.kinds.registry import kind_of
 from v2v_server.store.planes import PLANES
 from v2v_server.store.store_file import StoreFile
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_INDEXED_SIDE_PX
@@ -103,6 +102,42 @@ class StringColumn(Sequence[str]):
 
 
 NO_STRINGS = StringColumn(b"", np.zeros(0, np.int64))
+
+
+@dataclass(frozen=True, slots=True)
+class IndexRow(Persisted):
+    """What is known of one file.
+
+    Attributes:
+        id: relative POSIX path.
+        size_bytes, mtime_ns, ctime_ns: of the file when it was probed; a size of -1, which no file has, lets it be
+            probed again at the next start.
+        fingerprint: see :mod:`v2v_server.video.fingerprint`.
+        frames, width_px, height_px, frames_per_second, codec, interlaced, remark: see
+            :class:`v2v_server.video.probe.VideoFacts`; frames_per_second is None where unknown.
+        problem: why the file cannot be used; None if it can.
+        frame_index: ``FrameIndex.to_bytes()``; None with a problem, and where only the other columns were read.
+    """
+
+    id: str
+    size_bytes: Int64
+    mtime_ns: Int64 = 0
+    ctime_ns: Int64 = 0
+    fingerprint: str = ""
+    frames: Int64 = 0
+    width_px: Int64 = 0
+    height_px: Int64 = 0
+    frames_per_second: float | None = None
+    codec: str = ""
+    interlaced: bool = False
+    problem: str | None = None
+    remark: str = ""
+    frame_index: bytes | None = None
+
+    @property
+    def columns(self) -> tuple[Any, ...]:
+        """Return the attributes without the frame index."""
+        return tuple(getattr(self, name) for name in self.__slots__[:-1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -411,7 +446,7 @@ class Videos(Sequence[VideoEntry]):
 
         Fingerprints cover the track and its orientation.
         """
-        of_kind = "".join(f"{kind}\n" for kind in {kind_of(id) for id in self.ids[:1]} if kind != "videos")
+        of_kind = "".join(kind_of(id).in_digest for id in self.ids[:1])
         sha = hashlib.sha256(f"v2v catalogue 2\n{rows}\n{of_kind}".encode())
         pos, neg = NO_THRESHOLDS
         none, limits = f"{pos}\0{neg}", {number: f"{pos}\0{neg}" for number, (pos, neg) in self._thresholds.items()}
@@ -478,17 +513,6 @@ def missing_arrays(source: VideoSource, ids: Sequence[str]) -> dict[str, str]:
         "that they were prepared from"
         for name, plane in PLANES.items()
         if plane.serves in ARRAYS and not (source.is_local and all(_has_plane(source, id, name) for id in some))
-    }
-
-
-def unknown_arrays(kind: str) -> dict[str, str]:
-    """Return the arrays that cannot be made from any video of a kind, with the remedy."""
-    if kind != "photographs":
-        return {"tracks": "--videos-kind photographs, where all motion is known: ask for flow, which is estimated"}
-    labels = {name for name, form in ARRAYS.items() if form.needs.sidecars and name != "masks"}
-    return {
-        "frames_rgb": "the colour of a video, and photographs are rendered in grey: ask for frames",
-        **dict.fromkeys(labels, "labels beside a video, and photographs move: ask for masks and tracks"),
     }
 
 

@@ -8,6 +8,7 @@ scenes); the server worker calls :func:`simulate_clip`. The pixel model is in ``
     intensity.py      from grey level to log intensity and to light
     clip.py           simulate a clip: check arguments, frames of any kind to grey levels
     kernels.py        call the kernel that a clip needs; its result
+    continued.py      a clip of any length, piece by piece
     pixel.py          the paper's kernel: all pixels, all steps, one pass
     noise.py          its random numbers: the definition
     voxel.py          steps, segments, bins and dtypes: the definition

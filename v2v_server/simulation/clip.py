@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import STARTS, TIME_UNITS, Recipe, effect_settings, most_events
+from v2v_protocol.recipe import STARTS, TIME_UNITS, Recipe, effect_settings, most_events, warn_unusual
 from v2v_protocol.sample import SampleParams, needs_of
 from v2v_protocol.settings import nearest, plain, require_known
 from v2v_server.simulation.draw import noise_key_of_seed
@@ -21,7 +21,7 @@ from v2v_server.simulation.intensity import Intensity, log_table_float64
 from v2v_server.simulation.kernels import KernelInput, Voxels
 from v2v_server.simulation.precision import AUTO, EFFECTS_MARGIN, check_thresholds, choose, noise_sum
 from v2v_server.simulation.voxel import Levels, bin_edges, timed_edges
-from v2v_server.video.picture import MOST_BITS, SDR, TRANSFERS, Signal
+from v2v_server.video.picture import SDR, TRANSFERS, Signal
 
 _WEIGHTS = (299, 587, 114)
 """Weights of red, green and blue in grey (ITU-R BT.601), thousandths."""
@@ -72,7 +72,7 @@ def simulate(
         precision: arithmetic of the pixels: "float32", "float64", or "auto" for the narrowest that keeps the error
             below half a threshold (``precision.py``).
         frames_per_second: frame rate of the frames; needed for an effect in Hz or seconds.
-        bits: 9 to 12 for frames of uint16 [n, H, W] with levels 0 .. 2**bits - 1.
+        bits: 9 to 16 for frames of uint16 [n, H, W] with levels 0 .. 2**bits - 1.
         transfer: "pq", "hlg", "log100", "log316" or "linear" (``intensity.py``); "" uses gamma.
         start: "uniform" draws the residuals between -threshold_neg and threshold_pos, as the paper's code does,
             "triangular" as in a camera that has run for a long time; "zero" starts them at 0.
@@ -200,8 +200,7 @@ def simulate_clip(
             f"step_seconds {list(step_seconds.shape)}: give {steps} positive finite durations, one per step"
         )
     check_thresholds(params.threshold_pos, params.threshold_neg)
-    log_eps = recipe.log_eps[0] if params.log_eps is None else params.log_eps
-    intensity = Intensity(recipe.gamma, log_eps, signal)
+    intensity = intensity_of(params, recipe, signal)
     edges = (
         timed_edges(ends, recipe.bins, step_seconds)
         if recipe.is_timed
@@ -278,9 +277,18 @@ def _simulate_array(
         start_residual, start=start,
     )  # fmt: skip
     real = choose(precision, _most_events(given, ends))
+    camera = {"threshold_pos": threshold_pos, "noise_sigma": noise_sigma, "hot_pixel_sigma": hot_pixel_sigma, **effects}
+    other = {} if threshold_neg == threshold_pos else {"threshold_neg": threshold_neg}
+    of_light = {} if intensity is None else {"gamma": intensity.gamma, "log_eps": intensity.log_eps}
+    warn_unusual("", camera | other | of_light)
     if intensity is None:
         given = dataclasses.replace(given, frames=frames.astype(real))
     return Voxels.of(given, real)
+
+
+def intensity_of(params: SampleParams, recipe: Recipe, signal: Signal = SDR) -> Intensity:
+    """Return what determines the log intensity of a sample's grey levels."""
+    return Intensity(recipe.gamma, recipe.log_eps[0] if params.log_eps is None else params.log_eps, signal)
 
 
 def grey_levels(frames: Any, signal: Signal = SDR) -> npt.NDArray[Any]:
@@ -303,8 +311,8 @@ def grey_levels(frames: Any, signal: Signal = SDR) -> npt.NDArray[Any]:
     """
     if signal.transfer not in ("", *TRANSFERS.values()):
         raise UsageError(f"transfer {signal.transfer!r}: choose one of {', '.join(TRANSFERS.values())}, or ''")
-    if signal.bits not in range(8, MOST_BITS + 1):
-        raise UsageError(f"bits = {signal.bits!r}: give a whole number from 8 to {MOST_BITS}")
+    if signal.bits not in range(8, 17):
+        raise UsageError(f"bits = {signal.bits!r}: give a whole number from 8 to 16")
     try:
         given = np.asarray(frames)
     except (TypeError, RuntimeError) as error:  # raised by torch for a tensor on a GPU or one that requires gradients

@@ -58,6 +58,7 @@ class Purpose(IntEnum):
     WORLD_PATH = 20
     WORLD_KNOTS = 21
     WORLD_POINTS = 22
+    EXPOSURE = 23
 
 
 _LOG_EPS_STEPS = 32
@@ -160,6 +161,7 @@ def draw(
             if (value := _effect(recipe, name, stream(_stream_of(name), 1)[0]))
         },
         log_eps=_log_eps(recipe.log_eps, stream(Purpose.LOG_EPS, 1)[0]),
+        exposure_seconds=in_range(recipe.exposure_seconds, stream(Purpose.EXPOSURE, 1)[0]),
     )
     return _timed(params, recipe, stream, times) if recipe.is_timed else params
 

@@ -122,6 +122,17 @@ def tone_table(gamma: float, signal: Signal) -> npt.NDArray[np.uint8]:
     return _read_only(np.floor(255.0 * value + 0.5).astype(np.uint8))
 
 
+def tones_of(light: Doubles, gamma: float) -> npt.NDArray[np.uint8]:
+    """Return the grey levels in ``frames`` of light, [...], 1 for white, as :func:`tone_table` rounds them."""
+    return np.searchsorted(_tone_edges(gamma), light, side="right").astype(np.uint8)
+
+
+@functools.lru_cache(maxsize=16)
+def _tone_edges(gamma: float) -> Doubles:
+    """Return the light at which each grey level but the first begins, [255], read-only."""
+    return _read_only(_power((np.arange(255) + 0.5) / 255, gamma))
+
+
 def eight_bits(frames: npt.NDArray[Any], signal: Signal) -> npt.NDArray[np.uint8]:
     """Return levels, [n, H, W], in 8 bits: rounded, with the same transfer. Levels of 8 bits are returned unchanged."""
     return frames if signal.bits == 8 else tone_table(1.0, Signal(signal.bits))[frames]

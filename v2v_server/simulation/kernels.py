@@ -8,7 +8,7 @@ import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,7 @@ from v2v_server.simulation.intensity import Intensity, fine_table, log_table, lo
 from v2v_server.simulation.pixel import hot_pixels, simulate_pixels
 from v2v_server.simulation.precision import Real
 from v2v_server.simulation.representations import NAMES, REPRESENTATIONS, fill_array, new_memory
+from v2v_server.simulation.representations.listing import EventRows, Listing, columns_in_order, new_rows
 from v2v_server.simulation.voxel import (
     LARGEST_COUNT,
     Doubles,
@@ -31,13 +32,31 @@ from v2v_server.simulation.voxel import (
     Longs,
     Moments,
     Timeline,
+    frame_times,
     new_array,
     rounding_tolerance,
     time_of,
     timeline,
 )
 
-_NO_LIST = np.empty((0, 4))
+_NO_LIST = Listing(new_rows(0).own, *np.empty((2, 0)), *np.empty((2, 0), np.int64))
+
+
+class Carried(NamedTuple):
+    """What pixels remember from one piece of a clip to the next: the pieces have the events of the clip.
+
+    Attributes:
+        before, after: [1 + effects.kernel.ROWS, pixels], without effects [1, pixels], of the arithmetic of all pieces:
+            the state at the start, and at the end, which is written.
+        steps, segments: number of those before the piece.
+        resumes: whether the pixels start from ``before``; else as a clip of its own does.
+    """
+
+    before: npt.NDArray[Any]
+    after: npt.NDArray[Any]
+    steps: int = 0
+    segments: int = 0
+    resumes: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +78,7 @@ class KernelInput:
         start: how it is drawn, "uniform" or "triangular"; "zero" starts at 0.
         levels: intermediate levels, or None.
         grids_have_durations: whether a grid's time is that of ``step_seconds``; else all its steps count as equal.
+        carried: what a piece of a longer clip starts from and leaves; None: a clip of its own.
     """
 
     frames: npt.NDArray[Any]
@@ -74,6 +94,7 @@ class KernelInput:
     levels: Levels | None = None
     grids_have_durations: bool = False
     start: str = "uniform"
+    carried: Carried | None = None
 
     def __post_init__(self) -> None:
         if self.dtype not in LARGEST_COUNT:
@@ -153,20 +174,36 @@ def list_events(given: KernelInput, real: Real, step_us: Doubles) -> EventList:
         UsageError: the clip lasts less than a microsecond or more than 2**62.
     """
     check_duration(float(step_us.sum()))
+    since_us = frame_times(step_us)
+    count, _ = list_piece(given, real, step_us, since_us, new_rows(1))
+    return list_piece(given, real, step_us, since_us, new_rows(count))[1]
+
+
+def list_piece(
+    given: KernelInput, real: Real, step_us: Doubles, since_us: Doubles, rows: EventRows
+) -> tuple[int, EventList]:
+    """List the events of a piece of a clip, see :func:`list_events`.
+
+    Args:
+        given, real, step_us: see :func:`list_events`.
+        since_us: [steps + 1] time of each frame, microseconds, at least 0.
+        rows: memory for the events.
+
+    Returns:
+        the number of events, and the events; not all of them if there are more than ``rows`` can hold.
+    """
     general = _General(given, real)
-    rows = np.empty((general.run({}, np.empty((1, 4)))["listing"], 4))
-    general.run({}, rows)
-    pixel, segment, is_positive = rows[:, :3].T.astype(np.int64)
-    part = general.timeline
-    starts = time_of(Moments(part.step, part.start), step_us)
-    first_us = whole_edges(time_of(given.edges, step_us))
-    bin_of = part.bin[segment]
-    t = np.floor(starts[segment] + rows[:, 3] * (part.share * step_us[part.step])[segment]).astype(np.int64)
-    t = np.maximum(np.minimum(t, first_us[bin_of + 1] - 1), first_us[bin_of])
-    order = np.lexsort((pixel, t))
+    part, first_us = general.timeline, whole_edges(time_of(given.edges, step_us, since_us))
+    listing = Listing(
+        rows.own, time_of(Moments(part.step, part.start), step_us, since_us), part.share * step_us[part.step],
+        first_us[part.bin], first_us[part.bin + 1] - 1,
+    )  # fmt: skip
+    count = general.run({}, listing)["listing"]
     _, height, width = given.frames.shape
-    y, x = np.divmod(pixel[order], width)
-    return EventList(x.astype(np.uint16), y.astype(np.uint16), t[order], is_positive[order] > 0, width, height)
+    listed = min(count, len(rows.own))
+    place, t, p = np.empty((2, listed), np.uint16), np.empty(listed, np.int64), np.empty(listed, np.bool_)
+    columns_in_order(rows.own[:listed], rows.spare[:listed], width, place, t, p)
+    return count, EventList(place[0], place[1], t, p, width, height)
 
 
 @dataclass(frozen=True, slots=True, repr=False, eq=False)
@@ -289,20 +326,23 @@ class _General:
         self._given, self._real, self.timeline = given, real, given.timeline()
         part, params = self.timeline, given.params
         self._pixels = given.frames[0].size
+        nothing = np.empty((0, self._pixels), real)
+        self._carried = carried = given.carried or Carried(nothing, nothing)
         whole_noise = _noise_scale(params, given.noise_durations)
         rows = np.where(part.level < 0, part.level, given.source_index[np.maximum(part.level, 0)])
         self._segments = Segments(
-            part.step, rows, given.source_index[part.step + 1], part.reached.astype(real), part.bin,
+            part.step + carried.steps, rows, given.source_index[part.step + 1], part.reached.astype(real), part.bin,
             (whole_noise[part.step] * part.share if len(whole_noise) else whole_noise).astype(real),
             (given.noise_durations[part.step] * part.share).astype(real),
+            np.int64(carried.segments), carried.resumes,
         )  # fmt: skip
         self._tables = effects.prepare(
             params.effects, params.noise_key, given.intensity or Intensity(1.0, 1.0),
             given.step_seconds[part.step] * part.share, self._pixels, real,
-            (params.threshold_pos, params.threshold_neg),
+            (params.threshold_pos, params.threshold_neg), carried.segments,
         )  # fmt: skip
 
-    def run(self, arrays: Mapping[str, npt.NDArray[Any]], listing: Doubles = _NO_LIST) -> dict[str, int]:
+    def run(self, arrays: Mapping[str, npt.NDArray[Any]], listing: Listing = _NO_LIST) -> dict[str, int]:
         """Fill arrays, by name, and the listing if it has rows; return how many values of each did not fit its dtype,
         and the number of events that were to be listed.
         """
@@ -323,9 +363,9 @@ class _General:
             table, fine_table(table), np.array(params.noise_key, np.uint32), self._segments,
             *_hot(params, pixels, real), real(params.threshold_pos), real(params.threshold_neg),
             real(rounding_tolerance(smallest, smallest)), law, real(fixed), not params.effects,
-            len(listing) > 0 or any(hasattr(REPRESENTATIONS[name], "events") for name in arrays),
+            len(listing.rows) > 0 or any(hasattr(REPRESENTATIONS[name], "events") for name in arrays),
             not params.effects and arrays.keys() == {"voxels"}, given.bins, real(LARGEST_COUNT[given.dtype]), made,
-            clipped, self._tables,
+            clipped, self._tables, self._carried.before, self._carried.after,
         )  # fmt: skip
         counts: dict[str, int] = dict(zip(REPRESENTATIONS, clipped.tolist(), strict=True))
         return counts | {name: counts[name] + fill_array(array, memory[name]) for name, array in arrays.items()}

@@ -126,9 +126,17 @@ def timed_edges(ends: Longs, bins: int, durations: Doubles) -> Moments:
     return Moments(np.concatenate(([0], steps)), np.concatenate(([0.0], shares)))
 
 
-def time_of(moments: Moments, durations: Doubles) -> Doubles:
-    """Return the time of each moment since the clip's start, [n], in the unit of the durations, [steps]."""
-    since = np.concatenate(([0.0], np.cumsum(durations)))
+def frame_times(durations: Doubles) -> Doubles:
+    """Return the time of each frame since the clip's start, [steps + 1], in the unit of the durations, [steps]."""
+    return np.concatenate(([0.0], np.cumsum(durations)))
+
+
+def time_of(moments: Moments, durations: Doubles, since: Doubles | None = None) -> Doubles:
+    """Return the time of each moment, [n], in the unit of the durations, [steps].
+
+    ``since``: [steps + 1] time of each frame; None counts from the clip's start.
+    """
+    since = frame_times(durations) if since is None else since
     return np.asarray(since[moments.step] + moments.share * np.append(durations, 0.0)[moments.step])
 
 

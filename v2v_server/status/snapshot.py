@@ -34,10 +34,9 @@ from typing import Any, TypeAlias
 from v2v_protocol import PROTOCOL_VERSION, __version__
 from v2v_protocol.link.router import Sockets
 from v2v_protocol.messages import LARGEST_HEADER_BYTES, Status, encode
-from v2v_server.broker.dispatcher import Dispatcher
 from v2v_server.broker.leases import Member, clean_name
 from v2v_server.broker.session import AWAY_SECONDS, Session
-from v2v_server.broker.state import Counters, FaultTotal, RefusalPart, SendStatus, ToConsumer, ToWorker
+from v2v_server.broker.state import Broker, Counters, FaultTotal, RefusalPart, SendStatus, ToConsumer, ToWorker
 from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue, CorpusPart
 from v2v_server.quarantine import QuarantinePart, VerdictPart
@@ -124,15 +123,15 @@ class TimeWindow:
 
 
 class History:
-    """The last ten seconds of a dispatcher.
+    """The last ten seconds of a broker.
 
     Args:
-        dispatcher: whose totals are noted.
+        broker: whose totals are noted.
         now: monotonic time, seconds.
     """
 
-    def __init__(self, dispatcher: Dispatcher, now: float) -> None:
-        self._dispatcher = dispatcher
+    def __init__(self, broker: Broker, now: float) -> None:
+        self._broker = broker
         self._moments: deque[Moment] = deque()
         self._noted = self._note_at = now
         self._clocks: defaultdict[str, float] = defaultdict(float)
@@ -148,11 +147,11 @@ class History:
         """
         passed, self._noted = max(0.0, now - self._noted), now
         busy, self._broker_seconds = broker_seconds - self._broker_seconds, broker_seconds
-        if consumers := self._dispatcher.consumers:
+        if consumers := self._broker.consumers:
             # Idle workers matter only while there is a consumer.
             self._attended_at = now
-            worker = passed * self._dispatcher.workers
-            idle = worker * self._dispatcher.idle_share
+            worker = passed * self._broker.workers
+            idle = worker * self._broker.idle_share
             clocks = {
                 "attended": passed,
                 "broker": busy,
@@ -170,7 +169,7 @@ class History:
 
     def is_attended(self, now: float) -> bool:
         """Return whether there is a consumer, or was a moment ago: between epochs they leave and return."""
-        return now - self._attended_at < AWAY_SECONDS or self._dispatcher.consumers > 0
+        return now - self._attended_at < AWAY_SECONDS or self._broker.consumers > 0
 
     def window(self, now: float) -> TimeWindow:
         """Return the last ten seconds, or the time since the start."""
@@ -180,11 +179,11 @@ class History:
     def _moment(self, now: float) -> Moment:
         peers: dict[bytes | int, tuple[float, ...]] = {
             identity: (now, member.work.busy_seconds, member.work.cpu_seconds)
-            for identity, member in self._dispatcher.registry.members.items()
+            for identity, member in self._broker.registry.members.items()
         }
-        for each in self._dispatcher.sessions.totals():
+        for each in self._broker.sessions.totals():
             peers[each.number] = each.present(now), each.served, each.waited_seconds, each.passed
-        return Moment(now, values(self._dispatcher.counters) | self._clocks, peers)
+        return Moment(now, values(self._broker.counters) | self._clocks, peers)
 
 
 def _share(help: str, part: str, words: str) -> Any:
@@ -502,16 +501,14 @@ def to_json(status: StatusFields, most_bytes: int = LARGEST_HEADER_BYTES - 1024)
     return encoded
 
 
-def _worker(
-    dispatcher: Dispatcher, identity: bytes, member: Member, restarts: int | None, window: TimeWindow
-) -> WorkerPart:
-    now, leases = window.last.now, dispatcher.leases
+def _worker(broker: Broker, identity: bytes, member: Member, restarts: int | None, window: TimeWindow) -> WorkerPart:
+    now, leases = window.last.now, broker.leases
     request, since = leases.in_work(identity) or (None, now)
-    video, frame = (None if request is None else dispatcher.clip_of(request)) or ("", None)
+    video, frame = (None if request is None else broker.clip_of(request)) or ("", None)
     busy, cores = window.rates_of(identity)
     if member.given_up:
         state = "lost"
-    elif dispatcher.registry.is_resting(identity):
+    elif identity in broker.registry.resting:
         state = "resting"
     else:
         state = "working" if identity in leases.held else "idle"
@@ -573,7 +570,7 @@ class StatusPublisher:
     """Build the status of one server, and answer requests for it.
 
     Args:
-        config, catalogue, dispatcher, pool, sockets: what the status is read from.
+        config, catalogue, broker, pool, sockets: what the status is read from.
         now: monotonic time of the server's start, seconds.
         wall_clock: returns the time of day, ISO 8601.
 
@@ -585,17 +582,17 @@ class StatusPublisher:
         self,
         config: ServeConfig,
         catalogue: Catalogue,
-        dispatcher: Dispatcher,
+        broker: Broker,
         pool: Pool,
         sockets: Sockets,
         now: float,
         wall_clock: Callable[[], str],
     ) -> None:
-        self._config, self._catalogue, self._dispatcher = config, catalogue, dispatcher
+        self._config, self._catalogue, self._broker = config, catalogue, broker
         self._pool, self._sockets, self._wall_clock = pool, sockets, wall_clock
         self._started = now
         self._waited_before = sockets.waited_seconds
-        self._history = History(dispatcher, now)
+        self._history = History(broker, now)
         self._processor_clock = time.thread_time
         self._waiting: dict[SendStatus, None] = {}
         self._answer_at = now
@@ -603,8 +600,8 @@ class StatusPublisher:
 
     def status(self, now: float) -> StatusFields:
         """Return the current status."""
-        dispatcher, window = self._dispatcher, self._history.window(now)
-        counters, shares = dispatcher.counters, Shares.of(window)
+        broker, window = self._broker, self._history.window(now)
+        counters, shares = broker.counters, Shares.of(window)
         cache = cache_part(
             self._config.cache,
             self._config.cache_gib,
@@ -617,17 +614,17 @@ class StatusPublisher:
             **values(self._server(now)),
             **values(self._catalogue.part()),
             **values(self._load(window)),
-            **values(dispatcher.quarantine.part()),
+            **values(broker.quarantine.part()),
             "waiting": values(self._bottleneck(shares, now)) | {"shares": values(shares)},
             "totals": values(counters) | values(FaultTotal(counters.faults)),
             "cache": None if cache is None else values(cache),
             "workers": [
-                values(_worker(dispatcher, identity, member, restarts.get(member.name.encode()), window))
-                for identity, member in list(dispatcher.registry.members.items())[:MOST_SHOWN]
+                values(_worker(broker, identity, member, restarts.get(member.name.encode()), window))
+                for identity, member in list(broker.registry.members.items())[:MOST_SHOWN]
             ],
-            "consumers": [values(_consumer(each, window)) for each in list(dispatcher.sessions)[:MOST_SHOWN]],
-            "refusals": [values(each) for each in reversed(dispatcher.refusals)],
-            "verdicts": [values(each) for each in dispatcher.quarantine.verdict_parts()],
+            "consumers": [values(_consumer(each, window)) for each in list(broker.sessions)[:MOST_SHOWN]],
+            "refusals": [values(each) for each in reversed(broker.refusals)],
+            "verdicts": [values(each) for each in broker.quarantine.verdict_parts()],
         }
 
     def _server(self, now: float) -> ServerPart:
@@ -645,8 +642,8 @@ class StatusPublisher:
         )
 
     def _load(self, window: TimeWindow) -> LoadPart:
-        dispatcher = self._dispatcher
-        specs = {each.spec.digest: each.spec for each in dispatcher.sessions}
+        broker = self._broker
+        specs = {each.spec.digest: each.spec for each in broker.sessions}
         return LoadPart(
             specs={digest: spec.to_dict() for digest, spec in list(specs.items())[:_MOST_SPECS]},
             samples_per_second=window.rate("samples"),
@@ -654,22 +651,22 @@ class StatusPublisher:
             bytes_per_second=window.rate("bytes"),
             decodes_per_second=window.rate("decodes"),
             shared_share=window.rate("shared") / max(window.rate("samples"), 1e-9),
-            queue=dispatcher.waiting,
-            queued_share=dispatcher.waiting_share,
-            worker_count=dispatcher.workers,
+            queue=broker.waiting,
+            queued_share=broker.waiting_share,
+            worker_count=broker.workers,
             worker_processes=self._pool.running,
             workers_wanted=self._config.workers,
-            consumer_count=dispatcher.consumers,
+            consumer_count=broker.consumers,
         )
 
     def _bottleneck(self, shares: Shares, now: float) -> Bottleneck:
-        dispatcher = self._dispatcher
+        broker = self._broker
         return find_bottleneck(
             shares,
             is_attended=self._history.is_attended(now),
-            workers=dispatcher.workers,
-            starting=max(0, self._pool.running - dispatcher.workers),
-            trouble=dispatcher.blocked_reason or dispatcher.registry.trouble(self._config.workers_in_all),
+            workers=broker.workers,
+            starting=max(0, self._pool.running - broker.workers),
+            trouble=broker.blocked_reason or broker.registry.trouble(self._config.workers_in_all),
             has_cache=bool(self._config.cache),
         )
 

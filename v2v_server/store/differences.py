@@ -4,7 +4,7 @@ A block is some frames of a rectangle of the picture. The first frame is stored 
 other frame as differences to the frame before, all modulo 256, so every value is recovered exactly. Frames decoded from
 lossy video mostly repeat the frame before, and differences of 0 compress to almost nothing.
 
-Like :mod:`v2v_server.video.full_range`, the module uses nothing of other files, and its signatures accept every layout.
+Like :mod:`v2v_server.video.levels`, the module uses nothing of other files, and its signatures accept every layout.
 """
 
 # mypy: allow-untyped-defs

@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
-from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -18,11 +17,10 @@ import xxhash
 
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.store.picture_sequence import errors_of_pictures
-from v2v_server.store.pixels import IMAGE_SUFFIXES
 from v2v_server.video.decode import BIT_EXACT_CODECS, ClipRequest, Cut, DecodedClip, DecodedFrame, DecodedPicture
 from v2v_server.video.fingerprint import check_content, check_fingerprint
 from v2v_server.video.frame_index import LARGEST_INDEXED_SIDE_PX, FrameIndex, unseekable
-from v2v_server.video.picture import SDR, LumaFormat, PixelRect, Signal, luma_plane
+from v2v_server.video.picture import MOST_BITS, SDR, LumaFormat, PixelRect, Signal, luma_plane
 from v2v_server.video.picture_file import (
     LARGEST_PICTURE_FILE_BYTES,
     check_picture,
@@ -36,7 +34,6 @@ from v2v_server.video.source import LARGEST_PICTURE_PX
 if TYPE_CHECKING:
     from v2v_server.worlds.render import PhotoPyramid
 
-LOOKED_FOR = " ".join(sorted(IMAGE_SUFFIXES))
 _LEAST_SIDE_PX = 16
 _MODES = frozenset({"1", "L", "LA", "P", "PA", "RGB", "RGBA", "I;16", "I;16B"})
 """Pillow's names of the pixels that are read: grey, palettes and RGB."""
@@ -44,17 +41,12 @@ _KEPT_BYTES = 256 << 20
 """Decoded photographs that a worker keeps; one at least."""
 
 
-def id_of(path: str) -> str:
-    """Return the id of the photograph in a file, its path; "" for other files."""
-    return path if PurePosixPath(path).suffix.lower() in IMAGE_SUFFIXES else ""
-
-
 class _Still(NamedTuple):
     """A decoded photograph.
 
     Attributes:
         grey: [H, W] uint8, its usable rows.
-        pyramid: the same in 12 bits, from fine to coarse.
+        pyramid: the same in the bits that a world is rendered in, from fine to coarse.
         codec: FFmpeg's name of the format.
     """
 
@@ -86,7 +78,7 @@ class Photograph:
         check_fingerprint(self._path, fingerprint)
 
     def clips(self, request: ClipRequest) -> tuple[DecodedClip, ...]:
-        """Render the view of each sample, in 12 bits; without views, return the photograph as it stands, in 8 bits."""
+        """Render the view of each sample; without views, return the photograph as it stands, in 8 bits."""
         request.check()
         if not request.views:
             return tuple(self._still(request, cut) for cut in request.cuts)
@@ -122,14 +114,14 @@ class Photograph:
             VideoChanged: it is not the one that was checked.
             VideoError: it is damaged or differs from the index.
         """
-        index = request.index
+        index, bits = request.index, request.views[0].spec.recipe.world_bits if request.views else MOST_BITS
         with errors_of_pictures(self._path, lambda: (None, "")):
             status = os.stat(self._path)
-            key = self._path, status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino, request.rows
+            key = self._path, status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino, request.rows, bits
             if key not in kept_photographs:
                 data = self._read()
                 check_content(self._path, xxhash.xxh3_128(data).hexdigest(), self._fingerprint)
-                kept_photographs[key] = _decoded(data, index, request.usable)
+                kept_photographs[key] = _decoded(data, index, request.usable, bits)
             found = kept_photographs[key] = kept_photographs.pop(key)  # the latest is the last one
             while (
                 len(kept_photographs) > 1
@@ -139,8 +131,8 @@ class Photograph:
         return found
 
 
-def _decoded(data: bytes, index: FrameIndex, usable: PixelRect) -> _Still:
-    """Decode the usable rows of a photograph.
+def _decoded(data: bytes, index: FrameIndex, usable: PixelRect, bits: int) -> _Still:
+    """Decode the usable rows of a photograph; its pyramid has ``bits``.
 
     Raises:
         ValueError: it has another size than the index.
@@ -154,7 +146,7 @@ def _decoded(data: bytes, index: FrameIndex, usable: PixelRect) -> _Still:
         raise ValueError(f"has {found[1]}x{found[0]} px, and {size[1]}x{size[0]} px by its head")
     signal = SDR if luma.bits == SDR.bits else Signal(16)
     levels = DecodedFrame(frame, luma_plane(frame, luma), luma, lies, *size, signal, codec).part(usable, signal)
-    return _Still(eight_bits(levels, signal), pyramid_of(levels), codec)
+    return _Still(eight_bits(levels, signal), pyramid_of(levels, bits), codec)
 
 
 def _facts(data: bytes) -> VideoFacts:

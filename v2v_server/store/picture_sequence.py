@@ -53,9 +53,7 @@ from v2v_server.video.picture_file import (
 from v2v_server.video.probe import VideoFacts
 from v2v_server.video.source import reason
 
-LOOKED_FOR = f"folders and .zip archives of numbered {' '.join(sorted(IMAGE_SUFFIXES))}"
-
-
+_SIDECAR_FOLDERS = tuple(ending for ending in sidecar_endings(tuple(ARRAYS)) if ending.endswith("/"))
 _LOOKED_AT = 16
 """Pictures of 16 bits of which the highest level is looked for."""
 _KEPT_FILES, _SETTLED_NS = 1 << 20, 2 * 10**9
@@ -84,13 +82,10 @@ class Files:
 _kept = dict[str, Files]()
 
 
-def id_of(path: str) -> str:
-    """Return the id of the sequence that a file belongs to: an archive's own path, or a picture's folder with a slash;
-    "" for other files, and for the pictures of a sidecar, such as masks.
-    """
-    suffix, folder = PurePosixPath(path).suffix.lower(), f"{posixpath.dirname(path)}/"
-    is_sidecar = any(ending in folder for ending in sidecar_endings(tuple(ARRAYS)) if ending.endswith("/"))
-    return path if suffix == ".zip" else folder if suffix in IMAGE_SUFFIXES and not is_sidecar else ""
+def is_picture(path: str) -> bool:
+    """Return whether a file is a picture, and not that of a sidecar, such as masks."""
+    is_sidecar = any(ending in f"{posixpath.dirname(path)}/" for ending in _SIDECAR_FOLDERS)
+    return PurePosixPath(path).suffix.lower() in IMAGE_SUFFIXES and not is_sidecar
 
 
 class PictureSequence(VideoFile):
@@ -208,7 +203,7 @@ class PictureSequence(VideoFile):
         if files.pictures:
             return files.pictures
         named: dict[str, Any] = {
-            name: frame_of(name) for name in files.sizes if id_of(name).endswith("/") and "/." not in f"/{name}"
+            name: frame_of(name) for name in files.sizes if is_picture(name) and "/." not in f"/{name}"
         }
         if len(folders := {posixpath.dirname(name) for name in named}) != 1:
             raise ValueError(
@@ -238,7 +233,7 @@ class PictureSequence(VideoFile):
             first = next(iter(sorted(set(there).difference(found or there))), "")
             why = f"states times of {len(times)} pictures{f'; {first} has none' * bool(first)}"
             raise ValueError(f"{why}: give each of the {len(pictures)} pictures one, in their order")
-        return times, remark
+        return times, remark and f"{self._at[1]}: {remark}"
 
 
 @contextmanager

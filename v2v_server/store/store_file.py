@@ -35,9 +35,11 @@ from v2v_server.store.format import (
     unpack,
     unpack_record,
 )
-from v2v_server.store.planes import PLANES, Files, PlanePlace, pack_footer, read_footer
+from v2v_server.store.planes import PLANES
+from v2v_server.store.planes.plane import PlanePlace, pack_footer, read_footer
 from v2v_server.system.process import make_private
 from v2v_server.video.decode import ClipRequest, DecodedClip, DecodedPicture
+from v2v_server.video.file_range import FileRange, open_bytes
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.picture import MIXED, SDR, PixelRect, Signal
 from v2v_server.video.probe import VideoFacts
@@ -356,7 +358,7 @@ def read_clips(files: Sequence[StoreFile], request: ClipRequest, origin: str) ->
     transfers = {head.transfer for head in heads}
     transfer = MIXED if len(transfers) > 1 else heads[0].transfer
     signal = SDR if request.most_bits is None else Signal(bits, transfer)
-    parts: Files = [(stored, _held(stored.head, request)) for stored in files]
+    parts = [(stored, _held(stored.head, request)) for stored in files]
     added = []
     for name, plane in PLANES.items():
         if plane.is_wanted(request, signal):
@@ -395,10 +397,9 @@ def open_pixels(path: Path) -> StoreFile | None:
 def is_store_file(path: str | os.PathLike[str]) -> bool:
     """Return whether a file begins like a store file; False if it cannot be read."""
     try:
-        # Opening a FIFO without O_NONBLOCK would block until there is a writer.
-        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
-            return file.read(len(MAGIC)) == MAGIC
-    except OSError:
+        with open_bytes(path) as file:
+            return FileRange.parse(path) is None and file.read(len(MAGIC)) == MAGIC
+    except (OSError, VideoUnreadable):
         return False
 
 

@@ -17,6 +17,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 from v2v_protocol.errors import VideoChanged, VideoError, VideoUnreadable
+from v2v_server.video.file_range import file_of
 from v2v_server.video.fingerprint import CHANGED, check_content, files_in, unreadable
 
 if TYPE_CHECKING:  # a server's command line starts without the decoder
@@ -184,7 +185,7 @@ def _status(path: str) -> tuple[int, int, int, int]:
         VideoUnreadable: it cannot be opened.
     """
     try:
-        file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        file = os.open(file_of(path), os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         try:
             found = os.fstat(file)
         finally:

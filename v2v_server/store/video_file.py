@@ -12,15 +12,6 @@ from v2v_server.video.decode import ClipRequest, DecodedClip, DecodedPicture, Wa
 from v2v_server.video.fingerprint import check_fingerprint
 from v2v_server.video.probe import VideoFacts, probe
 
-VIDEO_SUFFIXES = frozenset({
-    ".3gp", ".avi", ".flv", ".h264", ".h265", ".hevc", ".ivf", ".m2ts", ".m4v", ".mjpeg", ".mjpg", ".mkv", ".mov",
-    ".mp4", ".mpeg", ".mpg", ".mts", ".mxf", ".obu", ".ogv", ".ts", ".vob", ".webm", ".wmv", ".y4m",
-})  # fmt: skip
-LOOKED_FOR = (
-    f"{' '.join(sorted(VIDEO_SUFFIXES))}; with --videos-kind sequences, folders of numbered pictures are videos, and "
-    "with --videos-kind photographs, each picture is a scene that moves"
-)
-
 
 class VideoFile:
     """:class:`v2v_server.store.pixels.Pixels` of a file, which is opened by each call."""
@@ -51,12 +42,6 @@ class VideoFile:
     def pictures(self, request: ClipRequest) -> Iterator[DecodedPicture]:
         """Decode one by one, see :func:`v2v_server.video.decode.stream_pictures`."""
         return stream_pictures(self._path, request, self.ways)
-
-
-def id_of(path: str) -> str:
-    """Return the id of the video in a file, its path; "" if the file is not named like a video."""
-    _, dot, ending = path.rpartition(".")
-    return path if dot and f".{ending.lower()}" in VIDEO_SUFFIXES else ""
 
 
 def open_pixels(path: str | os.PathLike[str]) -> AbstractContextManager[VideoFile]:

@@ -29,7 +29,7 @@ from v2v_protocol.errors import UsageError
 from v2v_protocol.keys import PeerKey
 from v2v_server.broker.leases import Cause, Loss
 from v2v_server.config import ServeConfig
-from v2v_server.schedule import WORKER_BYTES
+from v2v_server.lease_memory import WORKER_BYTES
 from v2v_server.supervise.local_host import LocalHost
 from v2v_server.supervise.pool import Exit, ProcessStatus
 

@@ -16,8 +16,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
@@ -29,12 +29,13 @@ from typing import Any, Generic, TypeVar, get_type_hints
 
 import msgpack
 
-from v2v_protocol.errors import UsageError
+from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.persisted import reader, to_plain
 from v2v_server.system.process import die_with_parent, limit_memory, relayed_output
 from v2v_server.system.sandbox import confine
 
 J = TypeVar("J")
+T = TypeVar("T")
 _R = TypeVar("_R")
 
 LARGEST_MESSAGE_BYTES = 64 << 20
@@ -115,7 +116,7 @@ def run_isolated(
     deadline_seconds: Callable[[J], float] | None = None,
     memory_bytes: int = 0,
     writable: Sequence[Path] | None = None,
-) -> Iterator[tuple[J, _R | Died]]:
+) -> Generator[tuple[J, _R | Died], None, None]:
     """Yield (job, result) for every job, in order of completion.
 
     A process takes one job after another; a process that dies is replaced. All are ended with the iterator, and die
@@ -187,6 +188,52 @@ def run_twice(
         else:
             yield job, result
     yield from run_isolated(function, suspects, min(processes, 1), **limits)
+
+
+def run_lent(
+    function: Callable[[J], _R],
+    items: Iterable[T],
+    lend: Callable[[T], AbstractContextManager[J]],
+    processes: int,
+    **limits: Any,
+) -> Iterator[tuple[T, _R | Died | V2VError | OSError]]:
+    """Do the same for items whose jobs need something of this process, such as bytes from a network, which a confined
+    process has not.
+
+    Args:
+        items: drawn as processes become free.
+        lend: makes the job of an item; the context ends when its result is there.
+
+    Yields:
+        each item with its result. An error of its context counts instead, also one at the end.
+    """
+    failed, lent = list[tuple[T, V2VError | OSError]](), dict[int, tuple[T, ExitStack]]()
+
+    def jobs() -> Iterator[J]:
+        for item in items:
+            with ExitStack() as stack:
+                try:
+                    job = stack.enter_context(lend(item))
+                except (V2VError, OSError) as error:
+                    failed.append((item, error))
+                    continue
+                lent[id(job)] = item, stack.pop_all()
+                yield job
+
+    try:
+        with closing(run_isolated(function, jobs(), processes, **limits)) as results:
+            for job, result in results:
+                item, stack = lent.pop(id(job))
+                found: _R | Died | V2VError | OSError = result
+                try:
+                    stack.close()
+                except (V2VError, OSError) as error:
+                    found = error
+                yield item, found
+    finally:  # once the processes have ended
+        for _, stack in lent.values():
+            stack.close()
+    yield from failed
 
 
 def _wait(lanes: list[_Lane[J, _R]]) -> list[Any]:

@@ -7,8 +7,8 @@ frame_index  which frames it has, and where decoding may begin
 decode       a range of frames, exactly: what is asked for, and the frames of each pass of a decoder
 picture      what the samples of a decoded picture mean: luma, colour, orientation
 picture_file one picture in a file: its head, its decoder, a check of what that delivers
-rgb          red, green and blue from grey and colour, compiled
-full_range   limited range to full range, compiled
+levels       limited range to full range; red, green and blue from grey and colour: compiled
 rows         which rows may be used
+file_range   a part of a file that is a file itself
 fingerprint  which file it is
 """

@@ -13,10 +13,10 @@ from __future__ import annotations
 
 import hashlib
 import os
-import stat
 from collections.abc import Mapping
 
 from v2v_protocol.errors import VideoChanged, VideoDenied, VideoGone, VideoUnreadable
+from v2v_server.video.file_range import open_bytes
 
 TIMES_ABOVE = ("../timestamps.txt", "../images.txt")
 TIMES = ("timestamps.txt", "images.txt", *TIMES_ABOVE)
@@ -36,17 +36,14 @@ def fingerprint(path: str | os.PathLike[str]) -> str:
     try:
         if os.path.isdir(path):
             return fingerprint_of({name: status.st_size for name, status in files_in(path)})
-        # An ordinary open of a named pipe would wait for somebody at its other end.
-        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
-            status = os.fstat(file.fileno())
-            if not stat.S_ISREG(status.st_mode):
-                raise VideoUnreadable(os.fspath(path), None, "is not a regular file")
+        with open_bytes(path) as file:
             digest = hashlib.sha256(b"v2v fingerprint 1\n" + file.read(_BLOCK_BYTES))
-            file.seek(max(0, status.st_size - _BLOCK_BYTES))
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(0, size - _BLOCK_BYTES))
             digest.update(file.read(_BLOCK_BYTES))
     except OSError as error:
         raise unreadable(os.fspath(path), error) from error
-    return f"{status.st_size}-{digest.hexdigest()[:32]}"
+    return f"{size}-{digest.hexdigest()[:32]}"
 
 
 def fingerprint_of(sizes: Mapping[str, int]) -> str:

@@ -264,7 +264,7 @@ def stretch(frames: npt.NDArray[Any], luma: LumaFormat) -> None:
     """
     if luma.bits == 8 and not luma.full_range:
         # Imported lazily: listing or opening videos must not load numba.
-        from v2v_server.video.full_range import to_full_range
+        from v2v_server.video.levels import to_full_range
 
         to_full_range(frames)
 

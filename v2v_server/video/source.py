@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import re
-import stat
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
@@ -24,6 +23,7 @@ from av.stream import Disposition
 from av.video.stream import VideoStream
 
 from v2v_protocol.errors import VideoError, VideoUnreadable
+from v2v_server.video.file_range import FileRange, file_of, open_bytes
 
 FORMATS = (
     "mov", "matroska", "avi", "dv", "flv", "ivf", "mpegts", "mpeg", "mpegvideo", "m4v", "mxf", "ogg", "asf", "h264",
@@ -46,7 +46,6 @@ LARGEST_PICTURE_PX = 2**26
 MOST_STREAMS = 100
 
 _OPTIONS = {
-    "protocol_whitelist": "file",
     "format_whitelist": ",".join(FORMATS),
     "codec_whitelist": ",".join(CODECS),
     "max_streams": str(MOST_STREAMS),
@@ -78,8 +77,9 @@ def opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Video
     """
     name = os.fspath(path)
     try:
-        # To open a named pipe waits for somebody to write into it, and a device may not end.
-        if not stat.S_ISREG(os.stat(name).st_mode):
+        # Opening a FIFO blocks until there is a writer, and a device may not end.
+        if not os.path.isfile(file_of(name)):
+            os.stat(file_of(name))
             raise VideoUnreadable(name, None, "is not a regular file")
         container = _open(name)
     except av.ArgumentError as error:
@@ -123,7 +123,10 @@ def moving_tracks(container: InputContainer) -> list[VideoStream]:
 def _open(name: str) -> InputContainer:
     # FFmpeg takes "12:30.mp4" for an address; no absolute path looks like one. Tags need not be UTF-8: old cameras and
     # QuickTime write others.
-    return av.open(os.path.abspath(name), "r", format=_raw_format(name), options=_OPTIONS, metadata_errors="replace")
+    is_part = FileRange.parse(name) is not None
+    options = _OPTIONS | {"protocol_whitelist": "file,subfile" if is_part else "file"}
+    path = name if is_part else os.path.abspath(name)
+    return av.open(path, "r", format=_raw_format(name), options=options, metadata_errors="replace")
 
 
 def _chosen(name: str, container: InputContainer, tracks: Sequence[VideoStream]) -> VideoStream:
@@ -156,7 +159,7 @@ def _frames_at_the_beginning(name: str, indexes: Sequence[int]) -> Counter[int]:
 
 def _raw_format(name: str) -> str | None:
     """Return FFmpeg's name of the container where its own guess is wrong: raw JPEG pictures, for it a still."""
-    with open(os.open(name, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+    with open_bytes(name) as file:
         return "mjpeg" if file.read(len(_JPEG)) == _JPEG else None
 
 
@@ -235,7 +238,7 @@ def dolby_vision_profile(path: str) -> int | None:
     Raises:
         OSError: the file cannot be read.
     """
-    with open(path, "rb") as file:
+    with open_bytes(path) as file:
         records = [found[1] for found in _MATROSKA_DOLBY.finditer(file.read(_HEAD_BYTES))]
         for kind, at in _boxes_of_entries(file):
             if kind in _DOLBY_KINDS:
@@ -251,9 +254,10 @@ def describe_cut(path: str) -> str:
     Raises:
         OSError: the file cannot be read.
     """
-    with open(path, "rb") as file:
-        size, head = os.fstat(file.fileno()).st_size, file.read(_HEAD_BYTES)
-        stated = 0
+    with open_bytes(path) as file:
+        size, stated = file.seek(0, os.SEEK_END), 0
+        file.seek(0)
+        head = file.read(_HEAD_BYTES)
         if head[:4] == b"RIFF" and head[4:8] != b"\xff\xff\xff\xff":
             stated = 8 + int.from_bytes(head[4:8], "little")
         elif head[:4] == _EBML and 0 < (at := head.find(_SEGMENT)) < len(head) - 12:
@@ -279,7 +283,7 @@ def count_transport_pictures(path: str) -> Counter[int]:
         OSError: the file cannot be read.
     """
     found = Counter[int]()
-    with open(path, "rb") as file:
+    with open_bytes(path) as file:
         while data := file.read(_PART_BYTES):
             for packet in _TRANSPORT_PACKET.finditer(data):
                 at = packet.end() + (packet[2][0] if packet[2] else 0)
@@ -298,7 +302,7 @@ def _transport_bytes(head: bytes) -> int:
 
 def _boxes_of_entries(file: BinaryIO) -> Iterator[tuple[bytes, int]]:
     """Yield (type, first byte of the content) of each box in a visual sample entry."""
-    end = os.fstat(file.fileno()).st_size
+    end = file.seek(0, os.SEEK_END)
     spans = [(0, end)]
     for kind in _WAY:
         skipped = _STSD_HEAD_BYTES * (kind == b"stsd")

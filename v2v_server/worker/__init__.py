@@ -2,7 +2,8 @@
 
 conversation   what the worker says: a state machine without I/O
 process        the process that does what the conversation says, with one decode for siblings, into its output buffer
-produce        from a lease to its sample: decode, open the files beside the video, view, simulate
+job            what is to be made, read from a lease
+making         from a job to its sample: plan, read, make
 arrays         functions that fill each array; additional arrays are files beside it
 scene_choice   which frames and which part of the picture are used, and which flow method a clip needs
 warm_up        compiled kernels, compiled once on a host

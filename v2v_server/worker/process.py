@@ -24,7 +24,8 @@ import secrets
 import signal
 import socket
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from importlib.resources.abc import Traversable
@@ -43,13 +44,14 @@ from v2v_protocol.arena import (
     find_memory,
     open_memory,
 )
-from v2v_protocol.errors import ProtocolError, SidecarError, UsageError, VideoChanged, VideoError, VideoUnreadable
+from v2v_protocol.errors import ProtocolError, SidecarError, UsageError, VideoError
 from v2v_protocol.keys import key_for, leaves_host
-from v2v_protocol.link.dealer import Dealer
-from v2v_protocol.messages import Buffer, Frames, Lease, Notes, Result, WorkerHello, encode_sample
+from v2v_protocol.link.dealer import Dealer, diagnose, wait_for_any
+from v2v_protocol.messages import Buffer, Frames, Lease, Notes, Ping, Result, WorkerHello, encode, encode_sample
 from v2v_protocol.sample import Form, Layout, new_arrays
+from v2v_server.corpus.sources.sidecars import sidecar_id
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.schedule import LARGEST_MEMORY_BYTES
+from v2v_server.lease_memory import LARGEST_MEMORY_BYTES
 from v2v_server.simulation.precision import USUAL
 from v2v_server.store.cache import Cache
 from v2v_server.system.compile_cache import compile_cache
@@ -65,6 +67,7 @@ from v2v_server.system.process import (
     take_long_turns,
 )
 from v2v_server.system.sandbox import confine
+from v2v_server.worker.arrays.boxes import read_ahead
 from v2v_server.worker.conversation import (
     CREDIT,
     Inspect,
@@ -79,17 +82,11 @@ from v2v_server.worker.conversation import (
     WorkerAction,
     WorkerConversation,
 )
+from v2v_server.worker.job import ClipJob, SampleJob
 from v2v_server.worker.logbook import IDLE, note, take_arena
-from v2v_server.worker.produce import (
-    Decoded,
-    decode_for,
-    kernels_of,
-    make_sample,
-    open_sidecars,
-    read_ahead,
-    sample_layout,
-    sidecar_files,
-)
+from v2v_server.worker.making.make import make_sample
+from v2v_server.worker.making.plan import kernels_of
+from v2v_server.worker.making.read import Clips, open_sidecars
 from v2v_server.worker.warm_up import is_compiled, load_in_turn, warm_up_in_turn
 
 Find: TypeAlias = Callable[[ArenaName, bool], int]
@@ -105,6 +102,8 @@ _LONGEST_ARENA_SECONDS = 1.0
 """Longest wait for a lease's arena, which is sent before the lease. Without it the sample goes into the message."""
 _LINGER_MS = 5000
 """Time that leaving may spend on sending the last sample."""
+_ASK_SECONDS = 3.0
+"""A server that does not answer a new worker in this time is reported before the kernels are compiled."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,68 +251,8 @@ def _map(descriptor: int, offset: int, size: int) -> npt.NDArray[np.uint8]:
     return np.frombuffer(mapping, np.uint8, size, offset - begin)
 
 
-class Clips:
-    """Decode clips for leases, together with those of their siblings.
-
-    Args:
-        source: where the videos come from.
-        cache: cache of decoded pieces for later epochs; None stores nothing.
-    """
-
-    def __init__(self, source: VideoSource, cache: Cache | None = None) -> None:
-        self._source = source
-        self._cache = cache
-        self._kept: dict[tuple[object, ...], Decoded] = {}
-
-    def take(self, lease: Lease) -> tuple[Decoded, bool]:
-        """Return the decoded clip of the lease's sample, and whether it was decoded just now.
-
-        Raises:
-            VideoError, ProtocolError: see :func:`v2v_server.worker.produce.decode_for`.
-        """
-        kept = self._kept.pop(_key(lease, lease.indices[0]), None)
-        if kept is not None:
-            return kept, False
-        self._kept = {}  # siblings that never came
-        if len(lease.indices) > 1:
-            try:
-                first, *others = decode_for(lease, lease.indices, self._source, self._cache)
-            except VideoError:
-                pass  # a sibling may need more of the clip than this sample; try without siblings
-            else:
-                self._kept = {_key(lease, index): one for index, one in zip(lease.indices[1:], others, strict=True)}
-                return first, True
-        try:
-            return decode_for(lease, lease.indices[:1], self._source, self._cache)[0], True
-        except (VideoChanged, VideoUnreadable):
-            raise
-        except VideoError:
-            # A decoder may hide a temporary storage error, so try once more. An error of the file repeats.
-            return decode_for(lease, lease.indices[:1], self._source, self._cache)[0], True
-
-    def said_of_cache(self, decoded: Decoded) -> str:
-        """Return the cache field of a sample's header, see :class:`v2v_protocol.messages.SampleHeader`."""
-        if self._cache is None or decoded.clip.origin == "store":
-            return ""
-        if decoded.clip.origin == "cache":
-            return "hit"
-        return f"miss: {self._cache.trouble}" if self._cache.trouble else "miss"
-
-    def has(self, lease: Lease) -> bool:
-        """Return whether the lease's sample needs no decoding."""
-        return _key(lease, lease.indices[0]) in self._kept
-
-
-def _key(lease: Lease, index: int) -> tuple[object, ...]:
-    """Return the fields of a lease that its decoded clip depends on, and its index."""
-    return (
-        lease.spec, lease.seed, lease.epoch, index, lease.arrays, lease.video, lease.fingerprint, lease.rows,
-        lease.start_frame, lease.thresholds,
-    )  # fmt: skip
-
-
 class Worker:
-    """One worker: a socket, kernels and clips, and the conversation that decides what to do with them.
+    """One worker: sockets, kernels and clips, and the conversation that decides what to do with them.
 
     Only a VideoError is reported as a failure of the video. Any other exception ends the process with a traceback. Its
     sample is then given to another worker, and a broken installation exhausts the server's crash budget instead of
@@ -322,7 +261,7 @@ class Worker:
     Args:
         name: unique name, see :func:`unshared_name`.
         source: where the videos come from.
-        address: where the server listens for workers.
+        brokers: where the brokers that it works for listen for workers.
         logbook: descriptor of the file for the lease in work, see :mod:`v2v_server.worker.logbook`.
         cache: cache of decoded clips for later epochs; None stores nothing.
         keys: file of its key; None reads the file that ``V2V_KEYS`` names, "" uses no key.
@@ -332,7 +271,7 @@ class Worker:
         insecure: see :class:`v2v_protocol.link.dealer.Dealer`.
 
     Raises:
-        UsageError: the socket cannot connect to the address.
+        UsageError: a socket cannot connect to its address.
         KeyRefused: the key file cannot be used.
     """
 
@@ -340,7 +279,7 @@ class Worker:
         self,
         name: str,
         source: VideoSource,
-        address: str,
+        brokers: Sequence[str],
         logbook: int | None = None,
         cache: Cache | None = None,
         keys: str | None = None,
@@ -349,7 +288,7 @@ class Worker:
         *,
         insecure: bool = False,
     ) -> None:
-        self._link = Dealer(address, keys, "worker", insecure=insecure)
+        self._links = [Dealer(address, keys, "worker", insecure=insecure) for address in brokers]
         self._name = name
         self._log = log or Log()
         self._logbook = logbook
@@ -360,9 +299,9 @@ class Worker:
         if cache is not None:
             cache.on_wait = self._note_wait
         self._source = source
-        self._sidecars: tuple[object, dict[str, Traversable | None] | SidecarError] = None, {}  # of the last lease
+        self._sidecars: tuple[ClipJob | None, dict[str, Traversable | None] | SidecarError] = None, {}  # the last ones
         self._unfetched: tuple[dict[str, str], VideoError] | None = None  # the last files that could not be fetched
-        self._is_remote = leaves_host(address)
+        self._are_remote = [leaves_host(address) for address in brokers]
         self._kernels = set(USUAL)  # loaded kernels
         self._handover_seconds = 0.0  # not yet reported in a result
         self._memory_bytes, self._weigh_at = 0, -math.inf
@@ -375,13 +314,14 @@ class Worker:
                 secrets.token_bytes(32),
                 notes=Notes(memory_bytes=memory_limit()),
             ),
-            address,
+            brokers,
             is_watched=logbook is not None,
         )
         try:
-            self._link.connect()
+            for link in self._links:
+                link.connect()
         except UsageError as error:
-            self._link.close()
+            self.close()
             raise UsageError(f"--connect: {error}") from error
 
     def stop(self) -> None:
@@ -392,9 +332,10 @@ class Worker:
         """Work until told to stop.
 
         Raises:
-            RemoteError: the server rejects this worker (another numerics version).
-            ProtocolError: the server speaks another version of the protocol, or a message cannot be read.
-            KeyRefused: the server rejects the key.
+            RemoteError: the only broker rejects this worker (another numerics version).
+            ProtocolError: the only broker speaks another version of the protocol, a message cannot be read, or each of
+                several brokers was left for such a reason.
+            KeyRefused: the only broker rejects the key.
         """
         try:
             actions = self._conversation.start(time.monotonic())
@@ -404,19 +345,25 @@ class Worker:
                     self._do(action)
                 actions = self._take(step)
         finally:
-            # Without a server there is no message worth waiting for.
-            self._link.disconnect(linger_ms=_LINGER_MS if self._conversation.has_server else 0)
-            self._link.close()
+            for link, broker in zip(self._links, self._conversation.brokers, strict=True):
+                # Without a server there is no message worth waiting for.
+                link.disconnect(linger_ms=_LINGER_MS if broker.is_there else 0)
+            self.close()
+
+    def close(self) -> None:
+        """Close all connections."""
+        for link in self._links:
+            link.close()
 
     def _do(self, action: WorkerAction) -> None:
         if isinstance(action, Send):
             began = time.monotonic()
-            self._link.send(action.frames)
+            self._links[action.broker].send(action.frames)
             self._handover_seconds += time.monotonic() - began
         elif isinstance(action, Reconnect) and self._find is find_memory:
             # Always with the same IP version: at most 320 s pass until the next connection, and "localhost" and most
             # names have two, of which the server listens on one.
-            self._link.connect()
+            self._links[action.broker].connect()
         elif isinstance(action, Say):
             self._log.say(f"{self._name}: {action.text}", "warning", worker=self._name)
 
@@ -428,22 +375,23 @@ class Worker:
                 messages = self._messages(seconds)
                 return conversation.on_messages(messages, time.monotonic())
             case Inspect(lease):
-                return conversation.on_inspected(self._inspect(lease), time.monotonic())
+                return conversation.on_inspected(self._inspect(ClipJob.of(lease), lease.indices[0]), time.monotonic())
             case Load(lease):
-                for variant in kernels_of(lease) - self._kernels:
+                clip = ClipJob.of(lease)
+                for variant in kernels_of(clip) - self._kernels:
                     load_in_turn(variant)
                     self._kernels.add(variant)
-                self._fetch(lease)
-                self._open_sidecars(lease)
+                self._fetch(clip, lease.indices[0])
+                self._open_sidecars(clip)
                 return conversation.on_kernels_loaded(time.monotonic())
-            case Make(lease):
-                if not self._clips.has(lease):
+            case Make(lease, broker):
+                if not self._clips.has(ClipJob.of(lease), lease.indices[0]):
                     give_way()  # processor caches are cold before a new clip, but warm within one
                 limit_processor_time(LONGEST_LEASE_SECONDS)
                 self._at = lease.lease
                 note(self._logbook, self._at, decodes=True)
                 try:
-                    made: tuple[Frames, Result] | VideoError | SidecarError = self._make_sample(lease)
+                    made: tuple[Frames, Result] | VideoError | SidecarError = self._make_sample(lease, broker)
                 except (VideoError, SidecarError) as error:
                     made = error
                 note(self._logbook, IDLE)  # not after another exception: it ends the worker, and this lease is to blame
@@ -457,59 +405,62 @@ class Worker:
             case _:
                 return []
 
-    def _inspect(self, lease: Lease) -> Readiness:
-        """Return what the work on a lease needs."""
-        missing, has_video = kernels_of(lease) - self._kernels, self._has_video(lease)
-        has_sidecars = not sidecar_files(lease) or self._sidecars[0] == _clip(lease)
-        is_ready = not missing and has_video and has_sidecars
-        is_small = has_video or _size_bytes(lease) <= _SOON_FETCHED_BYTES
-        return Readiness(is_ready, is_small and all(map(is_compiled, missing)), self._clips.has(lease))
+    def _inspect(self, clip: ClipJob, index: int) -> Readiness:
+        """Return what the work on a sample of a clip needs."""
+        missing, has_video = kernels_of(clip) - self._kernels, self._has_video(clip, index)
+        is_ready = not missing and has_video and (not clip.sidecars or self._sidecars[0] == clip)
+        is_small = has_video or _size_bytes(clip) <= _SOON_FETCHED_BYTES
+        return Readiness(is_ready, is_small and all(map(is_compiled, missing)), self._clips.has(clip, index))
 
     def _note_wait(self, waits: bool) -> None:
         """Exclude a wait for other processes from the decoding time."""
         note(self._logbook, self._at, decodes=not waits)
 
-    def _has_video(self, lease: Lease) -> bool:
-        """Return whether work on the lease can begin: its video is on this host, or fetching it has failed, which is
+    def _has_video(self, clip: ClipJob, index: int) -> bool:
+        """Return whether work on a sample can begin: its video is on this host, or fetching it has failed, which is
         reported.
         """
-        if self._clips.has(lease):
+        if self._clips.has(clip, index):
             return True
-        files = _files(lease)
-        self._source.expect(lease.video, lease.notes.state)
+        files = _files(clip)
+        self._source.expected = clip.video, clip.state
         return (self._unfetched is not None and self._unfetched[0] == files) or self._source.has(files)
 
-    def _fetch(self, lease: Lease) -> None:
-        """Fetch the lease's files before the lease is begun, so that network time does not count against the sample."""
-        if self._has_video(lease):
+    def _fetch(self, clip: ClipJob, index: int) -> None:
+        """Fetch a sample's files before its lease is begun, so that network time does not count against the sample."""
+        if self._has_video(clip, index):
             return
-        files = _files(lease)
+        files = _files(clip)
         try:
             self._source.fetch(files)
         except VideoError as error:
             self._unfetched = files, error
 
-    def _open_sidecars(self, lease: Lease) -> dict[str, Traversable | None] | SidecarError:
-        """Read the lease's sidecars before the lease is begun, so that their time does not count against the sample.
+    def _open_sidecars(self, clip: ClipJob) -> dict[str, Traversable | None] | SidecarError:
+        """Read a clip's sidecars before its lease is begun, so that their time does not count against the sample.
         Siblings use them too; the next clip checks them again.
         """
-        if self._sidecars[0] != _clip(lease):
+        if self._sidecars[0] != clip:
             try:
-                with open_sidecars(lease, self._source) as opened:
-                    read_ahead(lease, opened)
-                    self._sidecars = _clip(lease), opened
+                with open_sidecars(clip, self._source) as opened:
+                    if clip.sidecars:
+                        read_ahead(clip, opened)
+                    self._sidecars = clip, opened
             except SidecarError as error:
-                self._sidecars = _clip(lease), error
+                self._sidecars = clip, error
         return self._sidecars[1]
 
-    def _messages(self, wait_seconds: float) -> list[bytes]:
-        """Return the first frames of all available messages."""
-        messages: list[bytes] = []
-        frames = self._link.receive(wait_seconds)
-        while frames is not None:
-            messages.append(bytes(frames[0]))
-            frames = self._link.receive(0)
-        self._link.has_reconnected()  # raises if the server refuses the key; the conversation notices interruptions
+    def _messages(self, wait_seconds: float) -> list[tuple[int, bytes | UsageError]]:
+        """Return all available messages: of each its broker's number, and its first frame or why that is refused."""
+        messages: list[tuple[int, bytes | UsageError]] = []
+        wait_for_any(self._links, wait_seconds)
+        for broker, link in enumerate(self._links):
+            while (frames := link.receive(0)) is not None:
+                messages.append((broker, bytes(frames[0])))
+            try:
+                link.has_reconnected()  # raises if the server refuses the key; the conversation notices interruptions
+            except UsageError as error:
+                messages.append((broker, error))
         if messages and not self._is_confined:
             # Only now, because ZeroMQ connects in a thread of its own. No lease came before, so no video was opened.
             # A worker that loses this connection falls silent, and is ended and replaced by its server.
@@ -517,32 +468,33 @@ class Worker:
             self._is_confined = True
         return messages
 
-    def _make_sample(self, lease: Lease) -> tuple[Frames, Result]:
-        """Make a lease's sample; return its message and what it took.
+    def _make_sample(self, lease: Lease, broker: int) -> tuple[Frames, Result]:
+        """Make the sample of a broker's lease; return its message and what it took.
 
         Raises:
             VideoError, SidecarError: its video, or a file beside it, cannot be used.
         """
-        if self._unfetched is not None and self._unfetched[0] == _files(lease):
+        job = SampleJob.of(lease)
+        if self._unfetched is not None and self._unfetched[0] == _files(job.clip):
             error, self._unfetched = self._unfetched[1], None
             if error.video == lease.video:
                 raise error  # otherwise opening the sidecar reports it
         began = time.monotonic()
-        buffer = open_output_buffer(lease, sample_layout(lease), self._find)
+        buffer = open_output_buffer(lease, job.clip.layout, self._find)
         has_room = time.monotonic()
         started = time.process_time()
-        clip, decoded = self._clips.take(lease)
+        decoded, is_new = self._clips.take(job.clip, lease.indices)
         note(self._logbook, lease.lease)
-        if decoded and not clip.clip.origin:
+        if is_new and not decoded.clip.origin:
             # PyAV creates a reference cycle for a frame whose side data (its orientation) was read. Python's collector
             # counts few objects and waits, but each of them holds pictures.
             gc.collect()
         has_clip = time.monotonic()
-        sidecars = self._open_sidecars(lease)
+        sidecars = self._open_sidecars(job.clip)
         if isinstance(sidecars, SidecarError):
             self._sidecars = None, {}  # the next lease tries again
             raise sidecars
-        sample = make_sample(lease, clip, buffer.arrays, sidecars)
+        sample = make_sample(job, decoded, buffer.arrays, sidecars)
         has_sample = time.monotonic()
         frames = sample_message(
             lease,
@@ -550,9 +502,9 @@ class Worker:
             provenance=sample.provenance.to_dict(),
             worker=self._name,
             cpu_seconds=time.process_time() - started,
-            decoded=decoded,
-            cache=self._clips.said_of_cache(clip) if decoded else "",
-            packed=self._is_remote,
+            decoded=is_new,
+            cache=self._clips.said_of_cache(decoded) if is_new else "",
+            packed=self._are_remote[broker],
         )
         work = Result(
             lease.lease,
@@ -586,24 +538,37 @@ def unshared_name(beginning: str | None) -> str:
     return f"{beginning or f'{socket.gethostname()}-{os.getpid()}'}-{secrets.token_hex(4)}"
 
 
-def _size_bytes(lease: Lease) -> int:
-    """Return the size of the lease's video, which starts the fingerprint."""
-    size = lease.fingerprint.partition("-")[0]
+def _size_bytes(clip: ClipJob) -> int:
+    """Return the size of a clip's video, which starts the fingerprint."""
+    size = clip.fingerprint.partition("-")[0]
     return int(size) if size.isdecimal() else 0
 
 
-def _clip(lease: Lease) -> object:
-    """Return what a lease's sidecars are read for: equal for siblings."""
-    return lease.video, lease.arrays, lease.sidecars, lease.seed, lease.epoch, lease.start_frame
+def _files(clip: ClipJob) -> dict[str, str]:
+    """Return the fingerprints of the files that a clip's samples are made from, by id."""
+    beside = {sidecar_id(clip.video, ending): sidecar.fingerprint for ending, sidecar in clip.sidecars.items()}
+    return {clip.video: clip.fingerprint, **beside}
 
 
-def _files(lease: Lease) -> dict[str, str]:
-    """Return the fingerprints of the files that a lease's sample is made from, by id."""
-    return {lease.video: lease.fingerprint, **dict(sidecar_files(lease).values())}
+def _ask(address: str, keys: str | None, log: Log, *, insecure: bool) -> None:
+    """Ask whether the server answers, and say if it does not: the worker then waits, and compiles its kernels before.
+
+    Raises:
+        UsageError: see :func:`run_worker`.
+    """
+    with closing(Dealer(address, keys, "worker", insecure=insecure)) as link:
+        link.connect()
+        link.send(encode(Ping()))
+        deadline = time.monotonic() + _ASK_SECONDS
+        while time.monotonic() < deadline:
+            if link.receive(_ASK_SECONDS / 10) is not None:
+                return
+            link.has_reconnected()
+    log.say(f"{address}: {diagnose(address)}; waiting for it", "warning")
 
 
 def run_worker(
-    address: str,
+    brokers: Sequence[str],
     source: VideoSource,
     name: str | None,
     parent_pid: int | None,
@@ -615,10 +580,10 @@ def run_worker(
     *,
     insecure: bool = False,
 ) -> None:
-    """Run one worker in this process until the server stops it.
+    """Run one worker in this process until its brokers stop it.
 
     Args:
-        address: where the server listens for workers.
+        brokers: where each of them listens for workers.
         source: where the videos come from.
         name: unique name; by default host, process id and a random suffix.
         parent_pid: process id of the server if it started this worker, which then ends with it.
@@ -631,13 +596,20 @@ def run_worker(
         insecure: without a key, also work for a server on loopback that belongs to another user.
 
     Raises:
-        UsageError: the socket cannot connect to the address, or the server rejects the key or belongs to another user.
-        RemoteError: the server rejects this worker.
-        ProtocolError: the server speaks another version of the protocol, or a message cannot be read.
+        UsageError: a socket cannot connect to its address, or the only broker rejects the key or belongs to another
+            user.
+        RemoteError, ProtocolError: see :meth:`Worker.run`.
     """
     if parent_pid is not None:
         die_with_parent(parent_pid)
-    key_for(address, "worker", keys)  # reports a wrong key at once
+    for address in brokers:
+        key_for(address, "worker", keys)  # reports a wrong key at once
+        if logbook is None:
+            try:
+                _ask(address, keys, log or Log(), insecure=insecure)
+            except UsageError:
+                if len(brokers) == 1:  # one of several must not keep the worker from the others; it is asked again
+                    raise
     keep_freed_memory()
     limit_memory(LARGEST_MEMORY_BYTES)
     # A worker uses one core. OpenCV reads this when it is loaded, which some recipes never do.
@@ -648,14 +620,14 @@ def run_worker(
     gc.collect()
     gc.freeze()
     # Before ZeroMQ starts its threads, so that these are confined to the same files.
-    pool = socket.socket(fileno=arenas) if arenas is not None and address.startswith("ipc:") else None
+    pool = socket.socket(fileno=arenas) if arenas is not None and brokers[0].startswith("ipc:") else None
     if pool is not None:
         pool.settimeout(_LONGEST_ARENA_SECONDS)
     written = [*compile_cache(), *([] if cache is None else [cache.folder])]
     # The tools for object storage write elsewhere, and a worker of this host without a pool opens arenas itself.
-    confines_files = source.is_local and (pool is not None or leaves_host(address))
+    confines_files = source.is_local and (pool is not None or all(map(leaves_host, brokers)))
     confine(written if confines_files else None, network=True)
-    worker = Worker(name or unshared_name(None), source, address, logbook, cache, keys, log, pool, insecure=insecure)
+    worker = Worker(name or unshared_name(None), source, brokers, logbook, cache, keys, log, pool, insecure=insecure)
     signal.signal(signal.SIGTERM, lambda number, frame: worker.stop())
     # After ZeroMQ's threads have started, which should run without delay.
     take_long_turns()

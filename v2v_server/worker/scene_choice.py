@@ -27,8 +27,7 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.errors import ProtocolError, UsageError, VideoError
-from v2v_protocol.messages import Lease
+from v2v_protocol.errors import VideoError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
@@ -51,8 +50,7 @@ from v2v_server.flow import AUTO, SLOW_METHOD, SLOW_PX, STILL_GREY_LEVELS, STILL
 from v2v_server.simulation.draw import FrameTimes, resized_size
 from v2v_server.simulation.view import Window
 from v2v_server.video.decode import DecodedClip
-from v2v_server.video.frame_index import FrameIndex
-from v2v_server.video.rows import Rows
+from v2v_server.worker.job import ClipJob
 
 _LONGEST = np.iinfo(np.int16).max
 LEAN_METHOD = "dis-fast-lean"
@@ -128,57 +126,41 @@ def _motion_between(motion: npt.NDArray[np.int16], frames: npt.NDArray[np.int64]
     return np.clip(np.diff(way, axis=0, prepend=way[:1]), -_LONGEST, _LONGEST).astype(np.int16)
 
 
-def usable_window(lease: Lease, sides: Sides) -> Window:
-    """Return the part of a lease's upright picture that may be used: its rows without these bars."""
-    top, bottom = Rows.parse(lease.rows).bounds(lease.height_px)
-    height, width = bottom - top - sides.top - sides.bottom, lease.width_px - sides.left - sides.right
+def usable_window(clip: ClipJob, sides: Sides) -> Window:
+    """Return the part of a clip's upright picture that may be used: its rows without these bars."""
+    top, bottom = clip.rows.bounds(clip.height_px)
+    height, width = bottom - top - sides.top - sides.bottom, clip.width_px - sides.left - sides.right
     return Window(top + sides.top, sides.left, height, width)
 
 
-def within_rows(lease: Lease, sides: Sides) -> Window:
+def within_rows(clip: ClipJob, sides: Sides) -> Window:
     """Return the window of :func:`usable_window`, counted from the first usable row."""
-    top, _ = Rows.parse(lease.rows).bounds(lease.height_px)
-    usable = usable_window(lease, sides)
-    return usable._replace(top_px=usable.top_px - top)
+    return usable_window(clip, sides)._replace(top_px=sides.top)
 
 
-def most_frames(lease: Lease, spec: StreamSpec) -> int:
+def most_frames(clip: ClipJob) -> int:
     """Return how many frames a sample may use, those in between included: the same for every server, whose index of a
-    lease may hold more.
+    clip may hold more.
 
     Raises:
         VideoError: the recipe needs a frame rate, and the video's is unknown.
     """
-    recipe, rate = spec.recipe, lease.frames_per_second
+    recipe, rate = clip.spec.recipe, clip.frames_per_second
     if not recipe.is_timed:
         return recipe.frames_needed
     if not rate:
-        raise VideoError(lease.video, None, "its frame rate is unknown, and voxel_seconds needs it")
+        raise VideoError(clip.video, None, "its frame rate is unknown, and voxel_seconds needs it")
     needed = int(recipe.sequence_at(rate)) + 1
-    if spec.scene != "off":
+    if clip.spec.scene != "off":
         return needed
-    return min(int(recipe.reach_at(rate)) + 1, frame_index(lease, needed).end - lease.start_frame)
+    return min(int(recipe.reach_at(rate)) + 1, clip.frame_index(needed).end - clip.start_frame)
 
 
-def frame_times(lease: Lease, spec: StreamSpec, frames: CleanFrames) -> FrameTimes:
+def frame_times(clip: ClipJob, frames: CleanFrames) -> FrameTimes:
     """Return the time stamps of the frames that a sample may use."""
-    seconds = frame_index(lease, frames.span).seconds(lease.start_frame, frames.span)
-    rate = lease.frames_per_second / spec.recipe.frame_stride
+    seconds = clip.frame_index(frames.span).seconds(clip.start_frame, frames.span)
+    rate = clip.frames_per_second / clip.spec.recipe.frame_stride
     return FrameTimes(seconds[frames.numbers - frames.numbers[0]], rate)
-
-
-def frame_index(lease: Lease, count: int) -> FrameIndex:
-    """Decode the frame index of a lease, for this number of frames. Its server may not have checked it.
-
-    Raises:
-        VideoError: the index is damaged.
-    """
-    try:
-        index = FrameIndex.from_bytes(lease.frame_index)
-        index.position(lease.start_frame, count)
-    except (ProtocolError, UsageError) as error:
-        raise VideoError(lease.video, None, f"its index from the server is damaged: {error}") from error
-    return index
 
 
 @dataclass(frozen=True, slots=True)

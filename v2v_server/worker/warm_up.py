@@ -73,7 +73,7 @@ def load_kernels() -> None:
     """Load the kernels that every worker runs from the cache; compile those that are missing."""
     with _without_scipy():
         warm_up()
-    import_module("v2v_server.video.full_range")  # importing it compiles or loads its functions
+    import_module("v2v_server.video.levels")  # importing it compiles or loads its functions
 
 
 @contextmanager

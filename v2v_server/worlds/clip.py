@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -12,15 +13,19 @@ import numpy.typing as npt
 from v2v_protocol.recipe import preset
 from v2v_protocol.sample import array_layout, new_arrays
 from v2v_protocol.spec import MOST_SUBSTEPS, StreamSpec
+from v2v_server.simulation.clip import intensity_of
 from v2v_server.simulation.draw import draw
+from v2v_server.simulation.intensity import light_table, log_table, tones_of
 from v2v_server.simulation.view import apply_view, contrast_table
 from v2v_server.video.decode import BIT_EXACT_CODECS, DecodedClip, SampleView
-from v2v_server.video.picture import MOST_BITS, Signal
+from v2v_server.video.picture import Signal
 from v2v_server.worlds.render import (
     PhotoPyramid,
     flow_of,
     levels_between,
     masks_of,
+    parts_by_change,
+    parts_by_motion,
     pyramid_of,
     render,
     tracks_of,
@@ -28,6 +33,9 @@ from v2v_server.worlds.render import (
 from v2v_server.worlds.world import Doubles, World, draw_world
 
 _FLOW = "flow", "flow_valid"
+BLURRED = "frames_blurred"
+_PIECE_SECONDS, _PIECE_PX, _MOST_MOMENTS, _AT_ONCE = 1 / 200, 1 / 8, 8192, 64
+"""An exposure is rendered at moments between which nothing moves farther; motion is judged by pieces of the clip."""
 TRUTH = (*_FLOW, "masks", "tracks")
 """Arrays of a sample that are known exactly."""
 
@@ -57,19 +65,66 @@ def render_clip(
     )  # fmt: skip
     ends = params.ends(recipe)
     source = params.source_index(int(ends[-1]))
-    signal, seen = Signal(MOST_BITS), replace(params, scale=1.0)
-    levels = None
+    signal, seen = Signal(recipe.world_bits), replace(params, scale=1.0)
+    shown = contrast_table(params.contrast, signal.white) if params.contrast else None
+    parts = np.ones(len(seconds) - 1, np.int64)
     if spec.substep_px:
-        levels = levels_between(pyramid, world, seconds, source, spec.substep_px, MOST_SUBSTEPS)
-    if levels is not None and params.contrast:
-        table = contrast_table(params.contrast, signal.white)
-        levels = levels._replace(grey=np.stack([table[level] for level in levels.grey]))
+        parts = parts_by_motion(world, seconds, spec.substep_px, MOST_SUBSTEPS)
+    if recipe.world_change_share:
+        logs = log_table(*intensity_of(params, recipe, signal))
+        changes = np.stack([logs / np.float32(each) for each in (params.threshold_pos, params.threshold_neg)])
+        changes = changes if shown is None else changes[:, shown]
+        by_change = parts_by_change(pyramid, world, seconds, changes, recipe.world_change_share, MOST_SUBSTEPS)
+        parts = np.maximum(parts, by_change)
+    levels = levels_between(pyramid, world, seconds, source, parts)
+    if levels is not None and shown is not None:
+        levels = levels._replace(grey=np.stack([shown[level] for level in levels.grey]))
     frames = apply_view(render(pyramid, world, seconds), seen, recipe, signal)
     known = tuple(name for name in TRUTH if name in view.arrays)
     arrays = _truth(world, seconds[source[ends]], spec, known) if known else {}
+    if BLURRED in view.arrays:
+        light = light_table(recipe.gamma, signal)
+        light = light if shown is None else light[shown]
+        middles = ends[recipe.first_frame :]
+        total = _exposed(pyramid, world, seconds, source, middles, params.exposure_seconds, light)
+        arrays[BLURRED] = tones_of(total[:, None, :, :: -1 if world.flip else 1], recipe.gamma)
     return DecodedClip(
         frames, times, codec, codec in BIT_EXACT_CODECS, signal=signal, arrays=arrays, is_view=True, levels=levels
     )
+
+
+def _exposed(
+    pyramid: PhotoPyramid,
+    world: World,
+    seconds: Doubles,
+    source: npt.NDArray[np.int64],
+    middles: npt.NDArray[np.int64],
+    exposure_seconds: float,
+    light: Doubles,
+) -> Doubles:
+    """Return the mean light of some exposures, [n, H, W], not mirrored. Nothing moves while the camera pauses.
+
+    Args:
+        pyramid, world: the photograph and the draw.
+        seconds: moment of each frame, evenly spaced.
+        source: [steps + 1], which frame each position of the clip shows.
+        middles: [n], the positions in the middle of the exposures.
+        exposure_seconds: of each.
+        light: of each level.
+    """
+    step, last = float(seconds[-1]) / (len(seconds) - 1) if len(seconds) > 1 else 1.0, len(source) - 1
+    pieces = np.arange(0.0, seconds[-1] + 2 * _PIECE_SECONDS, _PIECE_SECONDS)
+    most = int(parts_by_motion(world, pieces, _PIECE_PX, _MOST_MOMENTS).max())
+    count = min(max(1, math.ceil(most * exposure_seconds / _PIECE_SECONDS)), _MOST_MOMENTS)
+    found = np.zeros((len(middles), *world.crop[2:]))
+    for total, middle in zip(found, (middles * step).tolist(), strict=True):
+        since = middle + exposure_seconds * ((np.arange(count) + 0.5) / count - 0.5)
+        moments = np.interp(since, np.arange(last + 1) * step, seconds[source])
+        moments += np.minimum(since, 0.0) + np.maximum(since - last * step, 0.0)
+        for first in range(0, count, _AT_ONCE):
+            for picture in render(pyramid, world, moments[first : first + _AT_ONCE]):
+                total += light[picture]
+    return found / count
 
 
 def _truth(world: World, ends: Doubles, spec: StreamSpec, names: tuple[str, ...]) -> dict[str, npt.NDArray[Any]]:

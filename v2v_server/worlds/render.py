@@ -1,6 +1,6 @@
-"""Render the pictures of a world at any times, in levels of 12 bits; where its points go, and what hides them.
+"""Render the pictures of a world at any times, in levels of 12 to 16 bits; where its points go, and what hides them.
 
-A pyramid has the photograph in 12 bits and its means of 2 x 2, each rounded. A layer that shows f pixels of the
+A pyramid has the photograph in these bits and its means of 2 x 2, each rounded. A layer that shows f pixels of the
 photograph in one of the picture (the root of the area, at the middle of the crop) is read from the levels 2^l <= f <
 2^(l+1) and l + 1, each bilinearly, in the ratio 2 - f / 2^l to f / 2^l - 1: a zoom has no moment at which the picture
 gets sharper at once. Below f = 1 level 0 is read alone. Beyond its border the photograph is mirrored.
@@ -20,10 +20,13 @@ import numpy.typing as npt
 
 from v2v_server.simulation.vectors import use_widest_vectors
 from v2v_server.simulation.voxel import Levels, Moments
+from v2v_server.video.picture import MOST_BITS
 from v2v_server.worlds.world import Doubles, World
 
-WHITEST = 4095
-"""The highest level of a rendered picture."""
+_LOOKED_AT = 4
+"""Of as many rows and columns, one is looked at to divide a step by how the light changes."""
+_FASTEST_SHARE = 100
+"""The fastest of as many pixels that change does not count there."""
 _LEAST_PART = 2.0**-14
 """A smaller share of the coarser level changes no level by a half. A picture in its own size reads none of it."""
 _LEAST_DEPTH = 2.0**-6
@@ -36,7 +39,7 @@ class PhotoPyramid(NamedTuple):
     """A photograph from fine to coarse.
 
     Attributes:
-        grey: [pixels of all levels] float32, one level after the other, whole numbers from 0 to WHITEST.
+        grey: [pixels of all levels] float32, one level after the other, whole numbers from 0 to white.
         first: [levels] int64, where each begins.
         size: [levels, 2] int64, height and width of each, at least 2.
     """
@@ -46,10 +49,15 @@ class PhotoPyramid(NamedTuple):
     size: npt.NDArray[np.int64]
 
 
-def pyramid_of(grey: npt.NDArray[Any]) -> PhotoPyramid:
-    """Return the pyramid of a photograph, [H, W] uint8 or uint16 grey levels from black to white of their type."""
-    white = np.iinfo(grey.dtype).max
-    table = ((np.arange(white + 1, dtype=np.uint64) * (2 * WHITEST) + white) // (2 * white)).astype(np.float32)
+def pyramid_of(grey: npt.NDArray[Any], bits: int = MOST_BITS) -> PhotoPyramid:
+    """Return the pyramid of a photograph, [H, W] uint8 or uint16 grey levels from black to white of their type.
+
+    Args:
+        grey: the photograph.
+        bits: of a level of the pyramid, at most 16.
+    """
+    white, whitest = np.iinfo(grey.dtype).max, 2**bits - 1
+    table = ((np.arange(white + 1, dtype=np.uint64) * (2 * whitest) + white) // (2 * white)).astype(np.float32)
     levels = [np.pad(table[grey], [(0, max(0, 2 - side)) for side in grey.shape], "edge")]
     while min(levels[-1].shape) > 2:
         level = np.pad(levels[-1], [(0, side % 2) for side in levels[-1].shape], "edge")
@@ -59,18 +67,20 @@ def pyramid_of(grey: npt.NDArray[Any]) -> PhotoPyramid:
     return PhotoPyramid(np.concatenate([level.ravel() for level in levels]), first, sizes)
 
 
-def render(pyramid: PhotoPyramid, world: World, seconds: Doubles) -> npt.NDArray[np.uint16]:
+def render(pyramid: PhotoPyramid, world: World, seconds: Doubles, every: int = 1) -> npt.NDArray[np.uint16]:
     """Return the pictures of a world.
 
     Args:
         pyramid: of its photograph.
         world: the draw.
         seconds: [n] moments.
+        every: of as many rows and columns, the first is rendered.
 
     Returns:
-        [n, H, W] uint16, the crop, 0 .. WHITEST, not mirrored.
+        [n, H, W] uint16, the crop, in levels of the pyramid, not mirrored; with ``every``, of fewer rows and columns.
     """
-    top, left, height, width = world.crop
+    top, left, *sides = world.crop
+    height, width = (-(-side // every) for side in sides)
     out, places, outlines = np.empty((len(seconds), height, width), np.uint16), world.places(seconds), world.outlines
     back, shown = _inverse(places)
     shown[:, 0] = np.maximum(shown[:, 0], 1 << world.focus)
@@ -79,15 +89,66 @@ def render(pyramid: PhotoPyramid, world: World, seconds: Doubles) -> npt.NDArray
         # A patch covers nothing beyond this.
         reach = outline[2] * (1.0 + 1.0 / (6.0 * outline[8])) * np.array([-1.0, 1.0])
         corners = (part.ravel() for part in np.meshgrid(outline[0] + reach, outline[1] + reach))
-        ends = np.stack(_taken(back[:, layer, None], *corners)) - np.array([left, top])[:, None, None]
+        ends = (np.stack(_taken(back[:, layer, None], *corners)) - np.array([left, top])[:, None, None]) / every
         for axis, side in enumerate((width, height)):
             box = np.floor(ends[axis].min(axis=1)), np.ceil(ends[axis].max(axis=1))
             boxes[:, layer, 2 - 2 * axis : 4 - 2 * axis] = np.clip(np.stack(box, axis=1), 0, side)
+    places[..., :2] *= every
     _render(
-        *pyramid, places, shown, boxes, outlines, top + 0.5, left + 0.5, np.empty((3, width)),
+        *pyramid, places, shown, boxes, outlines, (top + 0.5) / every, (left + 0.5) / every, np.empty((3, width)),
         np.empty((4, width), np.float32), np.empty((2, width), np.int32), np.empty((height, width), np.float32), out,
     )  # fmt: skip
     return out
+
+
+def parts_by_motion(world: World, seconds: Doubles, substep_px: float, most_parts: int) -> npt.NDArray[np.int64]:
+    """Return the number of sub-steps between each moment and the next that move by ``substep_px`` at most, [n - 1].
+
+    Args:
+        world: the draw.
+        seconds: [n] moments.
+        substep_px: longest motion of a sub-step, above 0.
+        most_parts: largest number of sub-steps.
+    """
+    top, left, height, width = world.crop
+    places, halves = world.places(seconds), np.arange(3) / 2
+    x, y = (part.ravel() for part in np.meshgrid(left + width * halves, top + height * halves))
+    to_x, to_y = _taken(_inverse(places[1:])[0][:, :, None], *_taken(places[:-1, :, None], x, y))
+    longest = np.sqrt(((to_x - x) * (to_x - x) + (to_y - y) * (to_y - y)).max(axis=(1, 2)))
+    more: npt.NDArray[np.int64] = np.minimum(longest / substep_px, most_parts - 1).astype(np.int64)
+    return more + 1
+
+
+def parts_by_change(
+    pyramid: PhotoPyramid,
+    world: World,
+    seconds: Doubles,
+    changes: npt.NDArray[np.float32],
+    share: float,
+    most_parts: int,
+) -> npt.NDArray[np.int64]:
+    """Return the number of sub-steps between each moment and the next in which 99 % of the pixels that change do so by
+    a share of their threshold at most, [n - 1].
+
+    It is told from the shortest sub-step after each moment, so light that comes back does not hide.
+
+    Args:
+        pyramid, world: the photograph and the draw.
+        seconds: [n] moments.
+        changes: [2, levels], log intensity of each level in thresholds of brighter and of darker events.
+        share: of the threshold, above 0.
+        most_parts: largest number of sub-steps.
+    """
+    begin, soon = (
+        render(pyramid, world, moments, _LOOKED_AT).reshape(len(moments), -1)
+        for moments in (seconds[:-1], seconds[:-1] + np.diff(seconds) / most_parts)
+    )
+    brighter, darker = (table[soon] - table[begin] for table in changes)
+    change = np.sort(np.maximum(brighter, -darker), axis=1)
+    last = change.shape[1] - 1 - np.count_nonzero(change, axis=1) // _FASTEST_SHARE
+    fastest = change[np.arange(len(change)), last] * np.float32(most_parts)
+    parts: npt.NDArray[np.int64] = np.clip(np.ceil(fastest / share), 1, most_parts).astype(np.int64)
+    return parts
 
 
 def levels_between(
@@ -95,8 +156,7 @@ def levels_between(
     world: World,
     seconds: Doubles,
     source_index: npt.NDArray[np.int64],
-    substep_px: float,
-    most_substeps: int,
+    parts: npt.NDArray[np.int64],
 ) -> Levels | None:
     """Return the levels between the frames of a sample, rendered at their times.
 
@@ -104,20 +164,14 @@ def levels_between(
         pyramid, world: the photograph and the draw.
         seconds: [n], moment of each frame.
         source_index: [steps + 1], which frame each position of the clip shows.
-        substep_px: longest motion of a sub-step, above 0.
-        most_substeps: of a step.
+        parts: [n - 1], sub-steps between each frame and the next, at least 1.
 
     Returns:
-        the levels, in 12 bits as the frames, mirrored if the crop is; None if no step is divided.
+        the levels, in the bits of the frames, mirrored if the crop is; None if no step is divided.
     """
-    top, left, height, width = world.crop
-    places, halves = world.places(seconds), np.arange(3) / 2
-    x, y = (part.ravel() for part in np.meshgrid(left + width * halves, top + height * halves))
-    to_x, to_y = _taken(_inverse(places[1:])[0][:, :, None], *_taken(places[:-1, :, None], x, y))
-    longest = np.sqrt(((to_x - x) * (to_x - x) + (to_y - y) * (to_y - y)).max(axis=(1, 2)))
     step = np.flatnonzero(np.diff(source_index))
     shown = source_index[step]
-    more = np.minimum(longest[shown] / substep_px, most_substeps - 1).astype(np.int64)
+    more = parts[shown] - 1
     if not more.any():
         return None
     share = np.concatenate([np.arange(1, count + 1) / (count + 1) for count in more])

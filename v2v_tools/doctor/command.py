@@ -26,14 +26,17 @@ from packaging.requirements import Requirement
 
 from v2v_protocol.command import FAILED, Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
-from v2v_protocol.programs import show, version_of
-from v2v_server.store.pixels import PIXEL_KINDS, VideosKind
+from v2v_protocol.programs import install_line, show, version_of
+from v2v_server.kinds.kind import VideosKind
+from v2v_server.kinds.registry import KindFlags, kind_from
 from v2v_server.system.process import control_group_memory, usable_cores
 from v2v_server.system.sandbox import can_confine
 
 OK, NOTE, BAD = "ok", "note", "bad"
 EXTRAS = ("server", "client", "trainer")
 """Extras of the distribution: where the videos are, where the GPU is, and there with the paper's networks."""
+_EQUIVALENT = {"opencv-contrib-python-headless": ("opencv-python-headless", "opencv-contrib-python", "opencv-python")}
+"""Packages that bring the same module; nothing that only the first one has is used."""
 NEEDED_CODECS = ("h264", "hevc", "vp8", "vp9", "libdav1d", "mpeg4", "mjpeg", "libx264")
 """Decoders of usual videos, and the encoder of films."""
 _GIB = 1 << 30
@@ -85,7 +88,7 @@ def run_checks(
     if videos is None:
         yield Finding(OK, "corpus", "not checked; --videos DIR checks one")
     elif missing["server"]:
-        yield Finding(BAD, "corpus", "cannot be checked without the extra 'server'", "pip install '.[server]'")
+        yield Finding(BAD, "corpus", "cannot be checked without the extra 'server'", install_line("server"))
     else:
         # Needs packages of that extra.
         corpus = importlib.import_module("v2v_tools.doctor.corpus")
@@ -110,10 +113,10 @@ def _missing(part: str) -> list[str]:
 
 
 def _is_here(requirement: Requirement) -> bool:
-    try:
-        return requirement.specifier.contains(metadata.version(requirement.name), prereleases=True)
-    except metadata.PackageNotFoundError:
-        return False
+    for name in (requirement.name, *_EQUIVALENT.get(requirement.name, ())):
+        with suppress(metadata.PackageNotFoundError):
+            return requirement.specifier.contains(metadata.version(name), prereleases=True)
+    return False
 
 
 def _installation(missing: dict[str, list[str]]) -> Iterator[Finding]:
@@ -122,7 +125,7 @@ def _installation(missing: dict[str, list[str]]) -> Iterator[Finding]:
             yield Finding(OK, part, "all required packages are installed")
         else:
             level = BAD if missing["server"] and missing["client"] and part != "trainer" else NOTE
-            change = f"pip install '.[{part}]' in a checkout, if you need that part on this machine"
+            change = f"{install_line(part)}, if you need that part on this machine"
             # Name the packages only if no part works: this machine may not need the others.
             text = f"not installed or too old: {', '.join(names)}" if level == BAD else "not complete"
             yield Finding(level, part, text, change)
@@ -248,13 +251,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     what.add_argument("--port", type=int, default=5555, metavar="N", help="port that a server would use (default 5555)")
     what.add_argument("--rows", default="full", metavar="ROWS", help="rows to use: full (default), top:0.54 (WebVid)")
-    what.add_argument("--videos-kind", choices=PIXEL_KINDS, help="what a video is, as for v2v-serve (default videos)")
-    what.add_argument("--rate", type=float, metavar="N", help="rate of picture sequences, or of photographs, Hz")
-    what.add_argument("--photograph-seconds", type=float, metavar="S", help="time for which each photograph is shown")
-    what.add_argument(
-        "--picture-bits", type=int, metavar="N", help="bits that 16-bit pictures of sequences hold, 8 to 15"
-    )
     what.add_argument("--cache-dir", metavar="DIR", help="folder of the catalogue index (default: the user's cache)")
+    parser.add_settings(KindFlags)
     return run_command(parser, _run, argv, failures=(V2VError,))
 
 
@@ -264,7 +262,7 @@ def _run(arguments: argparse.Namespace) -> int:
     found_bad = has_defects = False
     for finding in run_checks(
         arguments.port, arguments.videos, arguments.recipe, arguments.rows, arguments.cache_dir,
-        VideosKind.of(vars(arguments)),
+        kind_from(vars(arguments)),
     ):  # fmt: skip
         found_bad = found_bad or finding.level == BAD
         has_defects = has_defects or (finding.level, finding.about) == (NOTE, "pictures")

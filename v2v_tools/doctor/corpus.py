@@ -21,10 +21,12 @@ from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import recipe_setting
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.scenes.picture_check import look_at_pictures, name_all
-from v2v_server.corpus.sources.source import open_sidecar, sidecar_id
+from v2v_server.corpus.sources.sidecars import open_sidecar, sidecar_id
+from v2v_server.corpus_words import notes_of
+from v2v_server.kinds.kind import VideosKind
 from v2v_server.labels import READERS
-from v2v_server.schedule import SequenceTable, lease_bytes
-from v2v_server.store.pixels import VideosKind
+from v2v_server.lease_memory import lease_bytes
+from v2v_server.schedule import SequenceTable
 from v2v_server.system.process import memory_limit
 from v2v_server.video.rows import Rows
 from v2v_tools.doctor.motion import look_at_motion
@@ -72,7 +74,7 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str) -> Iterator[Line
         if any(os.strerror(errno.EACCES) in refusal.reason for refusal in catalogue.refusals):
             change += "; where permission is denied, let this user read the file and its folders (chmod, chown)"
         yield "note", "corpus", text, change
-    for note in catalogue.notes:
+    for note in notes_of(catalogue):
         yield "note", "corpus", note, ""
     for what, values in (
         ("interlaced", found.interlaced),
@@ -85,7 +87,7 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str) -> Iterator[Line
     yield from _labels(catalogue)
     frames_needed = int(np.median(spec.recipe.sequence_at(found.frames_per_second))) + 1
     defects = yield from look_at_pictures(catalogue, frames_needed)
-    if not catalogue.source.kind.is_rendered:  # as it stands, a photograph does not move
+    if catalogue.kind.has_motion:
         yield from look_at_motion(catalogue, defects)
     yield from _rates(found.frames_per_second, spec.recipe)
     table = SequenceTable(found, catalogue.rows, spec)
@@ -153,7 +155,7 @@ def _rates(rates: npt.NDArray[np.float64], recipe: Recipe) -> Iterator[Line]:
 
 
 def _how_videos_are_stored(catalogue: Catalogue) -> Iterator[Line]:
-    if catalogue.prepared is not None or catalogue.source.kind.has_parts:
+    if catalogue.prepared is not None or not catalogue.kind.seeks_by_time:
         return
     ids = [video.id for video in islice(catalogue.videos, _VIDEOS_OPENED)]
     unnamed = [id for id in ids if not catalogue.frame_index(id).seekable]

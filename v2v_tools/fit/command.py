@@ -89,10 +89,9 @@ def _fit(arguments: argparse.Namespace) -> None:
 
 def _sheet(file: str) -> dict[str, float]:
     values = read_yaml_mapping("--sheet", file)
-    wrong = {name: value for name, value in values.items() if not isinstance(value, int | float)}
-    if wrong:
-        name, value = next(iter(wrong.items()))
-        raise UsageError(f"--sheet {file}: {name} = {value!r}: give a number")
+    for name, value in values.items():
+        if not isinstance(value, int | float):
+            raise UsageError(f"--sheet {file}: {name} = {value!r}: give a number")
     return {name: float(value) for name, value in values.items()}
 
 

@@ -1,9 +1,9 @@
 """Estimate noise, mismatch and defects of a camera from what :mod:`v2v_tools.fit.increments` measures.
 
 mismatch               products of residuals of different increments of one pixel
-shot noise, leak       events of pixels that see no change
+shot noise, leak       events of pixels that see no change, unless their signs alternate
 refractory period      end of the distribution of the shortest intervals, by profile likelihood
-hot and dead pixels    pixels of a far higher rate than others; silent pixels among active ones
+hot and dead pixels    pixels of a far higher rate and one sign; silent pixels among active ones
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from v2v_tools.fit.increments import Increments
+from v2v_tools.fit.increments import Increments, events_of_steps
 from v2v_tools.fit.interval import Doubles, Estimate, bootstrap, sums_by_block, unknown
 from v2v_tools.fit.recording import Recorded
 from v2v_tools.fit.regression import LEAST_INCREMENTS, SYSTEMATIC, Regression
@@ -24,6 +24,8 @@ LEAST_SECONDS = 200.0
 _GLITCHES = 3e-5
 _MANY_SHORT, _EDGE, _LEAST_FLOOR, _BALANCED = 100, 0.01, 60, 0.2
 _MOST_BY_CHANCE, _SHARE_OF_DARK = 20.0, 0.7
+_IGNORES = "noise ignores it"
+_MOST_EXCESS, _MOST_MINORITY = 0.1, 0.2
 
 
 def mismatch(fitted: Regression, given: Increments, blocks: npt.NDArray[np.int64]) -> Estimate:
@@ -74,6 +76,28 @@ def mismatch(fitted: Regression, given: Increments, blocks: npt.NDArray[np.int64
     return estimate.widened(SYSTEMATIC["threshold_mismatch_sigma"])
 
 
+def unexplained(recording: Recorded, still: npt.NDArray[np.bool_], is_hot: npt.NDArray[np.bool_]) -> str:
+    """Return why shot noise and leak do not explain the events of still pixels; nothing if they may.
+
+    Both leave the sign of an event independent of the sign before it, because each event restarts its pixel. Pixels of
+    other rates have fewer opposite signs together, not more. Noise before the comparator and a lamp alternate.
+
+    Args:
+        still: [n - 1, P], see ``is_still``.
+        is_hot: [P].
+    """
+    step, owner, p = events_of_steps(recording)
+    quiet = still[step, owner] & ~is_hot[owner]
+    follows = (owner[1:] == owner[:-1]) & quiet[1:] & quiet[:-1]
+    count, on = int(follows.sum()), float(p[quiet].mean()) if quiet.any() else 0.0
+    opposite, expected = float((p[1:] != p[:-1])[follows].mean()) if count else 0.0, 2 * on * (1 - on)
+    why = (
+        f"events of still pixels alternate: {opposite:.0%} of {count} have the sign opposite to the one before, and "
+        f"shot noise and leak explain {expected:.0%}"
+    )
+    return why if opposite > expected + _MOST_EXCESS + 1.5 / math.sqrt(max(count, 1)) else ""
+
+
 def shot_noise(
     still: Doubles, blocks: npt.NDArray[np.int64], is_hot: npt.NDArray[np.bool_], static: bool = False
 ) -> Estimate:
@@ -84,8 +108,10 @@ def shot_noise(
     still = still * ~is_hot[:, None]
     seconds, _, on, off = still.sum(axis=(1, 2))
     if seconds < LEAST_SECONDS:
-        remedy = "record for longer" if static else "hold the camera still"
-        return unknown(f"{seconds:.0f} pixel-seconds without motion; needs {LEAST_SECONDS:.0f}: {remedy}")
+        return unknown(
+            f"{seconds:.0f} pixel-seconds without motion; needs {LEAST_SECONDS:.0f}: "
+            f"{'record for longer' if static else 'hold the camera still'}"
+        )
     sums = sums_by_block((blocks[:, None] * 4 + np.arange(4)).ravel(), still.reshape(4, -1).T, 4)
     value, low, high = bootstrap(sums, lambda s: np.array([2 * s[3] / max(s[0] - 0.75 * s[1], 1e-9)]))
     note = f"{on:.0f} brighter and {off:.0f} darker events in {seconds:.0f} pixel-seconds without motion"
@@ -114,7 +140,7 @@ def refractory(gaps_us: Doubles) -> Estimate:
     end = int(np.argmin(is_flat | (below <= least))) or len(edges) - 1
     floor = int(below[end - 1])
     if floor > least and abs(is_same[:floor].mean() - 0.5) < _BALANCED:
-        note = f"{floor} intervals of noise that ignores it, which end before {edges[end]:.0f} us"
+        note = f"{_IGNORES}: {floor} intervals of any two signs end before {edges[end]:.0f} us"
         return Estimate(0.0, 0.0, float(edges[end]) * 1e-6, 1e-4, note)
     gaps, is_same = gaps[glitches:], is_same[glitches:]
     shortest = float(gaps[0])
@@ -135,18 +161,17 @@ def refractory(gaps_us: Doubles) -> Estimate:
 
 
 def with_noise(period: Estimate, shot: Estimate, gaps_us: Doubles) -> Estimate:
-    """Return the estimate of the period with a note of whether noise obeys it.
+    """Return the estimate of the period, with a note of whether noise obeys it where noise events tell.
 
     Noise that ignores it follows another event within the period by chance. ``gaps_us``: [M] intervals.
     """
-    shorter = np.count_nonzero(gaps_us < 0.9e6 * period.low) if period.told else 0
-    by_chance = _SHARE_OF_DARK * shot.value * period.low * len(gaps_us) if period.told and shot.told else 0.0
-    if by_chance < _MOST_BY_CHANCE:
-        verdict = "whether noise obeys it cannot be told: too few noise events"
-    else:
-        verdict = f"noise {'obeys' if shorter < by_chance / 4 else 'ignores'} it: {shorter} shorter intervals, "
-        verdict += f"{by_chance:.0f} if noise ignored it"
-    return dataclasses.replace(period, note=f"{period.note}; {verdict}")
+    if not (period.told and shot.told) or _IGNORES in period.note:
+        return period
+    shorter = np.count_nonzero(gaps_us < 0.9e6 * period.low)
+    by_chance = _SHARE_OF_DARK * shot.value * period.low * len(gaps_us)
+    how = "obeys" if shorter < by_chance / 4 else "ignores"
+    verdict = f"noise {how} it: {shorter} shorter intervals, {by_chance:.0f} if noise ignored it"
+    return period if by_chance < _MOST_BY_CHANCE else dataclasses.replace(period, note=f"{period.note}; {verdict}")
 
 
 def hot_mask(still: Doubles) -> npt.NDArray[np.bool_]:
@@ -171,10 +196,12 @@ def hot_pixels(
     """
     seconds, _, on, off = still.sum(axis=2)
     seen = seconds >= 0.3
-    if seen.sum() < 500:
-        note = f"{seen.sum()} pixels without a change for 0.3 s; needs 500"
-        return unknown(note), unknown(note)
     hot = is_hot & seen
+    note = f"{hot.sum()} of {seen.sum()} pixels without a change fire far more often than the others"
+    few, both = seen.sum() < 500, np.minimum(on, off)[hot].sum() > _MOST_MINORITY * (on + off)[hot].sum()
+    if few or both:
+        why = f"{seen.sum()} pixels without a change for 0.3 s; needs 500" if few else f"{note}, with both signs"
+        return unknown(why), unknown(why)
     period = seconds[hot] / np.maximum(on + off, 1)[hot]
     drift = np.where((on > off)[hot], *thresholds) / np.maximum(period - refractory_seconds, 0.2 * period)
     others = seen & ~is_hot
@@ -190,13 +217,17 @@ def hot_pixels(
         if count < 1:
             return np.zeros(2)
         sigma = _untruncated(math.sqrt(squares / count), least)
-        return np.array([count / pixels / math.erfc(least / sigma / math.sqrt(2.0)), sigma])
+        return np.array([min(count / pixels / math.erfc(least / sigma / math.sqrt(2.0)), 1.0), sigma])
 
     value, low, high = bootstrap(sums, solve)
-    note = f"{hot.sum()} of {seen.sum()} pixels without a change fire far more often than the others"
     most = 3.0 / float(seen.sum())
-    share = Estimate(value[0], max(low[0], 0.0), max(high[0], most), 1e-3, note)
-    if hot.sum() < 5:
+    # A share of 1 rests on so short a tail that the rest of the distribution is a guess.
+    share = (
+        Estimate(value[0], max(low[0], 0.0), min(max(high[0], most), 1.0), 1e-3, note)
+        if value[0] < 1.0
+        else unknown(f"{note}, but barely beyond the limit")
+    )
+    if hot.sum() < 5 or value[0] >= 1.0:
         return share, unknown(note)
     # Few pixels: a bootstrap of blocks is too sure of the width of a normal distribution.
     half = 1.645 / math.sqrt(2 * hot.sum())

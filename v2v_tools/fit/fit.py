@@ -137,7 +137,8 @@ def _estimates(given: Recorded, is_blank: bool, static: bool) -> tuple[dict[str,
         ends = [regression.Regression(usual(end), blocks) for end in (period.low, period.high)]
         positive = positive.widened(0.0, abs(ends[1].positive.value - ends[0].positive.value) / 2)
         negative = negative.widened(0.0, abs(ends[1].negative.value - ends[0].negative.value) / 2)
-    shot = estimators.shot_noise(still, blocks, is_hot, static)
+    why = estimators.unexplained(given, at_rest, is_hot)
+    shot = unknown(why) if why else estimators.shot_noise(still, blocks, is_hot, static)
     if is_blank and shot.told:
         shot = dataclasses.replace(
             shot.widened(_STATIC_LIGHT_DOUBT),
@@ -148,7 +149,7 @@ def _estimates(given: Recorded, is_blank: bool, static: bool) -> tuple[dict[str,
         "threshold_mismatch_sigma": estimators.mismatch(fitted, increments, blocks),
         "photoreceptor_hz": fitted.corner if fitted.positive.told else unknown("needs the thresholds"),
         "refractory_seconds": estimators.with_noise(period, shot, gaps_us[0]), "shot_noise_hz": shot,
-        "dead_pixel_share": estimators.dead_pixels(given, blocks),
+        "dead_pixel_share": unknown(why) if why and static else estimators.dead_pixels(given, blocks),
     }  # fmt: skip
     values = _complete(_values(made))
     thresholds = values["threshold_pos"], values["threshold_neg"]
@@ -193,10 +194,10 @@ def _matched_leak(
     total = sums.sum(axis=0)
     # Few events: those of a Poisson process that was not seen to fire.
     high = max(high, float(np.interp((total[1] + 3.0) / max(total[0], 1e-9), rates(total), _LEAKS_HZ)))
-    most = high if high < _LEAKS_HZ[-1] else math.inf
     # Noise of s Hz resets the pixel, so that a leak of l Hz fires s / (exp(s / l) - 1) events a second.
     noise = max(shot.value, 1e-3)
     negligible = max(0.05, noise / math.log1p(noise / _LEAST_SURPLUS_HZ))
+    most = high if high < _LEAKS_HZ[-1] else math.inf
     made = Estimate(value, max(low, 0.0), most, negligible, f"simulated with leaks up to 4 Hz; {shot.note}")
     return made.widened(regression.SYSTEMATIC["leak_hz"])
 

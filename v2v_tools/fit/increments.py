@@ -105,7 +105,7 @@ def is_still(recording: Recorded) -> npt.NDArray[np.bool_]:
 def _events_around(recording: Recorded) -> npt.NDArray[np.float32]:
     """Return the events of the pixels around each pixel, per step and its neighbours in time: [n - 1, P]."""
     around = np.empty((len(recording.frames) - 1, len(recording.pixels)), np.float32)
-    step, owner, _ = _events_of_steps(recording)
+    step, owner, _ = events_of_steps(recording)
     counts = np.bincount(step * around.shape[1] + owner, minlength=around.size).reshape(around.shape)
     picture = np.zeros((recording.height_px, recording.width_px), np.float32)
     for number in range(len(around)):
@@ -116,7 +116,7 @@ def _events_around(recording: Recorded) -> npt.NDArray[np.float32]:
     return around
 
 
-def _events_of_steps(
+def events_of_steps(
     recording: Recorded,
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
     """Return step between frames, pixel and polarity of the events from the first to the last frame: [M]."""
@@ -138,7 +138,7 @@ def still_time(recording: Recorded, still: npt.NDArray[np.bool_]) -> Doubles:
     seconds = (np.diff(recording.frame_us)[:, None] * np.float32(1e-6) * still).astype(np.float32)
     lit = seconds * recording.known_light.of(np.arange(256.0)).astype(np.float32)[recording.frames[:-1]]
     times = [[part[quarter == q].sum(axis=0, dtype=np.float64) for q in range(4)] for part in (seconds, lit)]
-    step, owner, p = _events_of_steps(recording)
+    step, owner, p = events_of_steps(recording)
     here = still[step, owner]
     place = ((4 * (1 - p[here]) + quarter[step[here]]) * pixels) + owner[here]
     events = np.bincount(place, minlength=8 * pixels).reshape(2, 4, pixels)
@@ -149,8 +149,7 @@ def intervals_us(recording: Recorded) -> Doubles:
     """Return the intervals between events of a pixel, and whether both are brighter or both darker: [2, M] float64."""
     pixel = np.repeat(np.arange(len(recording.pixels)), np.diff(recording.first))
     same = np.diff(pixel) == 0
-    gap = np.diff(recording.t_us)[same].astype(np.float64)
-    return np.stack([gap, (recording.p[1:] == recording.p[:-1])[same]])
+    return np.stack([np.diff(recording.t_us), recording.p[1:] == recording.p[:-1]]).astype(np.float64)[:, same]
 
 
 def _quarter(recording: Recorded, t_us: npt.NDArray[Any]) -> npt.NDArray[np.int64]:

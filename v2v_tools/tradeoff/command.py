@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import math
 import sys
 import tempfile
@@ -30,20 +31,24 @@ from v2v_tools.tradeoff.measures import (
     diversity,
     leases_of,
     making,
+    motion_error,
 )
-from v2v_tools.tradeoff.report import ERROR_KEY, best, error_fields, name_dominated, tables
-from v2v_tools.tradeoff.settings import BESIDE, SOURCE, STORES, ServeSetting, axes, full_model, open_forms, settings
+from v2v_tools.tradeoff.report import MOTION_KEY, best, error_fields, error_of, name_dominated, tables
+from v2v_tools.tradeoff.settings import BESIDE, SOURCE, STORES, ServeSetting, axes, halves, open_forms, settings
 
+_MOST_REPEATS = 0.03
+"""From this share of the steps on, repeated frames are named."""
 _DEFAULT_FORMS = ("lossless dense", "lossless fast")
 
 
 def _parser() -> Parser:
     parser = Parser(
         "v2v-tradeoff", "--videos DIR [flags]",
-        "Measure on your clips what each way to serve them costs: processor time, disk space, voxel error against the "
-        "recipe's own full model, and diversity, for the source, stores and another encoding, with all combinations of "
-        "the values of some fields. A setting is dominated when another one is at least as good in everything and "
-        "better in one thing. Name the best setting for a wish, and write it for v2v-serve --config.",
+        "Measure on your clips what each way to serve them costs: processor time, disk space, the error of its form "
+        "against exactly decoded frames, the error where every second frame is left out, and diversity, for the "
+        "source, stores and another encoding, with all combinations of the values of some fields. A setting is "
+        "dominated when another one is at least as good in everything and better in one thing. Name the best setting "
+        "for a wish, and write it for v2v-serve --config.",
         [
             "v2v-tradeoff --videos clips/ --json tradeoff.json",
             "v2v-tradeoff --videos clips/ --target-rate 20 --vary samples_per_decode=1,2 --preset-out chosen.yaml",
@@ -77,7 +82,7 @@ def _parser() -> Parser:
     wishes = parser.group("Wish")
     wish = wishes.add_mutually_exclusive_group()
     wish.add_argument("--target-rate", type=float, metavar="X", help="least number of samples a second of one core")
-    wish.add_argument("--max-error", type=float, metavar="X", help="largest voxel error, as a share: 0.05 is 5 %%")
+    wish.add_argument("--max-error", type=float, metavar="X", help="largest of both errors, a share: 0.05 is 5 %%")
     parser.add_output("Output", "--preset-out", (".yaml", ".yml"), "write the best setting for v2v-serve --config")
     parser.add_output("Output", "--json", JSON, "write the records")
     return parser
@@ -120,36 +125,48 @@ def _run(asked: argparse.Namespace) -> int:
 
 def _measured(corpus: Mapping[str, Catalogue], compared: Sequence[ServeSetting]) -> list[dict[str, Any]]:
     """Return the records of all settings, of the two rows that give the scale, and of the diversity."""
-    models = {setting: full_model(setting, compared) for setting in compared}
     leases = {
         setting: leases_of(setting, corpus[setting.form])
-        for setting in dict.fromkeys((*(setting.single for setting in compared), *models.values()))
+        for setting in dict.fromkeys((*(each.single for each in compared), *(each.exact for each in compared)))
     }
     show(f"timing {len(compared)} settings", sys.stderr)
     works = {each.name: making(leases[each.single], each.spec.samples_per_decode) for each in compared}
     seconds = cpu_seconds(works, max(len(each.each) for each in leases.values()))
     records, scale = list[dict[str, Any]](), list[dict[str, Any]]()
-    for model in dict.fromkeys(models.values()):  # one for each recipe
-        mine = [setting for setting in compared if models[setting] == model]
-        show(f"comparing {len(mine)} settings with {model.way}", sys.stderr)
-        sums = accuracy(leases[model], {setting.way: leases[setting.single] for setting in mine})
-        found = []
+    for exact in dict.fromkeys(each.exact for each in compared):
+        mine = [setting for setting in compared if setting.exact == exact]
+        show(f"comparing {len(mine)} settings with {exact.way}", sys.stderr)
+        sums = accuracy(leases[exact], {setting.way: leases[setting.single] for setting in mine})
+        of_motion = _motion_fields(exact, corpus[SOURCE])
         for setting in mine:
             spec, clips, source = setting.spec, corpus[setting.form], corpus[SOURCE]
             taken = seconds[setting.name]
-            found.append({
+            records.append({
                 "measure": "setting", "name": setting.name, "way": setting.way, "form": setting.form,
                 "samples_per_decode": spec.samples_per_decode, "substep_px": spec.substep_px,
                 "bytes_ratio": _nbytes(clips) / _nbytes(source),
                 "bytes_per_video_second": _nbytes(clips) / _seconds(source),
                 "samples_per_core_second": 1.0 / taken, "cpu_seconds_per_sample": taken,
-                "speed_ratio": seconds[compared[0].name] / taken, **error_fields(sums[setting.way]),
+                "speed_ratio": seconds[compared[0].name] / taken, **error_fields(sums[setting.way]), **of_motion,
             })  # fmt: skip
-        name_dominated(found)
         scale = scale or [{"measure": "scale", "way": row, **error_fields(sums[row])} for row in (NOISE_ROW, DRAW_ROW)]
-        records += found
+    for recipe in dict.fromkeys(each.spec.recipe for each in compared):
+        names = {each.name for each in compared if each.spec.recipe == recipe}
+        name_dominated([record for record in records if record["name"] in names])
     show("measuring diversity", sys.stderr)
     return records + scale + diversity(leases[compared[0].single])
+
+
+def _motion_fields(setting: ServeSetting, source: Catalogue) -> dict[str, float | None]:
+    """Return the errors at twice the motion; say where repeated frames make them larger than motion does."""
+    whole, half = (dataclasses.replace(setting, spec=spec) for spec in halves(setting.spec))
+    found = motion_error(leases_of(whole, source), leases_of(half, source))
+    if found.repeats >= _MOST_REPEATS:
+        show(
+            f"{setting.way}: {found.repeats:.0%} of the frames repeat the one before: the error at twice the motion is "
+            "also theirs (v2v-serve --scene auto drops them)", sys.stderr,
+        )  # fmt: skip
+    return {MOTION_KEY: found.voxels, "count_error_at_twice_the_motion": found.events}
 
 
 def _nbytes(clips: Catalogue) -> int:
@@ -168,7 +185,7 @@ def choose(records: Sequence[Mapping[str, Any]], compared: Sequence[ServeSetting
     except UsageError as error:
         show(f"v2v-tradeoff: {error}", sys.stderr)
         return FAILED
-    why = f"{record['samples_per_core_second']:.3g} samples a core second, {ERROR_KEY} {record[ERROR_KEY] or 0.0:.3g}"
+    why = f"{record['samples_per_core_second']:.3g} samples a core second, error {error_of(record):.3g}"
     print(f"best: {record['name']}: {why}")
     if asked.preset_out is not None:
         (chosen,) = (setting for setting in compared if setting.name == record["name"])

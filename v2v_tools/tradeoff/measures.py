@@ -1,15 +1,20 @@
-"""What is measured of each setting: errors against its full model, and processor time; and how alike samples are.
+"""What is measured of each setting: what its form and its frames cost, and processor time; and how alike samples are.
 
 Everything is measured on the same sequences of the corpus in each form. A lease of each has four views: samples of one
 decode, next to each other.
 
-**Errors.** The full model has exactly decoded frames and the shortest sub-steps of all settings. Both sides are the
-same camera: the sample's own draw and noise key, with both thresholds set to the value in question. Hot pixels are left
-out: they fire alike on both sides and would make every relative error look small. With V the voxels and R those of the
-full model, summed over all leases, so that a clip weighs as much as it has events:
+**Errors of a form.** Both sides are the same setting and the same camera, R from exactly decoded frames: the sample's
+own draw and noise key, with both thresholds set to the value in question. Hot pixels are left out: they fire alike on
+both sides and would make every relative error look small. Summed over all leases, so that a clip weighs as much as it
+has events:
 
     voxel error    sum |V - R| / sum |R|
     count error    (sum |V| - sum |R|) / sum |R|
+
+**The error at twice the motion.** The clip judges the settings by what it knows: with every second frame left out, the
+setting's events V are compared with those of all frames R, without noise, in bins of two frames. Occlusions, insects
+and blur are the clip's own, and no model of motion decides. R has no events that fall between two frames, so at the
+clip's own motion a setting is off by less than this where things move evenly.
 
 **Resemblance.** The course of a sample is its number of events in each bin. Courses of different clips correlate as
 well, because every camera begins running and pauses later. The correlation of samples of one decode beyond that is
@@ -35,16 +40,22 @@ from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.schedule import Schedule, SequenceTable
 from v2v_server.simulation.clip import simulate_clip
+from v2v_server.simulation.kernels import Voxels
 from v2v_server.worker.arrays.context import SampleContext
-from v2v_server.worker.produce import decode_for, make_sample, plan_sample, sample_context
+from v2v_server.worker.job import ClipJob, SampleJob
+from v2v_server.worker.making.make import make_sample, sample_context
+from v2v_server.worker.making.plan import plan_sample
+from v2v_server.worker.making.read import decode_for
 from v2v_tools.remake import lease_for
-from v2v_tools.tradeoff.report import THRESHOLDS
+from v2v_tools.tradeoff.report import ERROR_THRESHOLD, THRESHOLDS
 from v2v_tools.tradeoff.settings import ServeSetting
 
 NOISE_ROW, DRAW_ROW = "another noise seed", "another threshold draw"
 _VIEWS = 4
 _LEASES_OF_A_CLIP = 2
 _ROUNDS = 3
+_REPEAT = 12
+"""Where a frame repeats the one before, a step has at most this part of the events of each neighbour."""
 
 
 class Leases(NamedTuple):
@@ -79,19 +90,20 @@ def leases_of(setting: ServeSetting, clips: Catalogue) -> Leases:
 def seen(leases: Leases, number: int, views: int = 1) -> list[SampleContext]:
     """Return the first views of a lease before simulation, without hot pixels, from one decode."""
     lease, contexts = leases.each[number], []
-    for decoded in decode_for(lease, lease.indices[:views], Folder(leases.root)):
-        context, _ = sample_context(lease, decoded, Needs(events=True))
+    clip = ClipJob.of(lease)
+    for decoded in decode_for(clip, lease.indices[:views], Folder(leases.root)):
+        context, _ = sample_context(clip, decoded, Needs(events=True))
         params = dataclasses.replace(context.params, hot_pixel_count=0)
         contexts.append(dataclasses.replace(context, params=params))
     return contexts
 
 
-def simulated(context: SampleContext, params: SampleParams) -> npt.NDArray[np.float32]:
-    """Return the voxels of a camera of these parameters, [lead voxels + T, bins, H, W], signed event counts."""
+def simulated(context: SampleContext, params: SampleParams) -> Voxels:
+    """Return what a camera of these parameters sees: voxels [lead voxels + T, bins, H, W] float32."""
     return simulate_clip(
         context.view, params, context.recipe, "float32", context.step_seconds, levels=context.levels,
         signal=context.signal,
-    ).voxels  # fmt: skip
+    )  # fmt: skip
 
 
 def compare(voxels: npt.NDArray[Any], reference: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
@@ -105,10 +117,10 @@ def compare(voxels: npt.NDArray[Any], reference: npt.NDArray[Any]) -> npt.NDArra
 
 
 def accuracy(model: Leases, others: Mapping[str, Leases]) -> dict[str, npt.NDArray[np.float64]]:
-    """Return the sums of :func:`compare` for settings that have one full model, [thresholds, 3], by name.
+    """Return the sums of :func:`compare` for forms of one setting, [thresholds, 3], by name.
 
     Args:
-        model: the full model.
+        model: from exactly decoded frames.
         others: by name; of the same sequences in the same order.
 
     Returns:
@@ -117,17 +129,56 @@ def accuracy(model: Leases, others: Mapping[str, Leases]) -> dict[str, npt.NDArr
     """
     sums = {name: np.zeros((len(THRESHOLDS), 3)) for name in (*others, NOISE_ROW, DRAW_ROW)}
     for number, lease in enumerate(model.each):
-        (exact,), drawn = seen(model, number), plan_sample(lease, lease.indices[1]).params
+        (exact,), drawn = seen(model, number), plan_sample(ClipJob.of(lease), lease.indices[1]).params
         contexts = {name: seen(other, number)[0] for name, other in others.items()}
         for row, threshold in enumerate(np.array(THRESHOLDS, np.float32).tolist()):
             camera = dataclasses.replace(exact.params, threshold_pos=threshold, threshold_neg=threshold)
             noisy = dataclasses.replace(camera, noise_key=drawn.noise_key)
             redrawn = dataclasses.replace(camera, threshold_pos=drawn.threshold_pos, threshold_neg=drawn.threshold_neg)
             made = {name: (context, camera) for name, context in contexts.items()}
-            truth = simulated(exact, camera)
+            truth = simulated(exact, camera).voxels
             for name, pair in (made | {NOISE_ROW: (exact, noisy), DRAW_ROW: (exact, redrawn)}).items():
-                sums[name][row] += compare(simulated(*pair), truth)
+                sums[name][row] += compare(simulated(*pair).voxels, truth)
     return sums
+
+
+class MotionError(NamedTuple):
+    """How a setting compares with all frames where every second one is left out, over all leases.
+
+    Attributes:
+        voxels: sum |V - R| / sum |R| over signed bins of two frames; None without events.
+        events: (events of V - events of R) / events of R, both polarities counted; None without events.
+        repeats: share of the steps between two frames that have hardly an event, between two that have many: frames
+            that repeat.
+    """
+
+    voxels: float | None
+    events: float | None
+    repeats: float
+
+
+def motion_error(all_frames: Leases, every_second: Leases) -> MotionError:
+    """Compare the events of every second frame with those of all, at ERROR_THRESHOLD.
+
+    Args:
+        all_frames, every_second: the streams of :func:`v2v_tools.tradeoff.settings.halves`.
+    """
+    difference = binned = told = true = 0.0
+    repeats = steps = 0
+    for number in range(len(all_frames.each)):
+        (whole,), (half,) = seen(all_frames, number), seen(every_second, number)
+        camera = dataclasses.replace(whole.params, threshold_pos=ERROR_THRESHOLD, threshold_neg=ERROR_THRESHOLD)
+        fine, coarse = simulated(whole, camera), simulated(half, camera)
+        truth = fine.voxels.reshape(-1, 2, *fine.voxels.shape[2:])
+        sums = compare(coarse.voxels.reshape(-1, *truth.shape[2:]), truth.sum(axis=1))
+        difference, binned = difference + sums[0], binned + sums[2]
+        told, true = told + coarse.array("event_counts").sum(), true + fine.array("event_counts").sum()
+        events = np.abs(truth).sum(axis=(2, 3)).ravel()
+        neighbours = np.minimum(events[:-2], events[2:])
+        repeats += int(np.count_nonzero((events[1:-1] * _REPEAT <= neighbours) & (neighbours > 0)))
+        steps += len(events)
+    of = float(difference / binned) if binned else None
+    return MotionError(of, float(told / true - 1.0) if true else None, repeats / steps)
 
 
 def diversity(leases: Leases) -> list[dict[str, Any]]:
@@ -140,7 +191,7 @@ def diversity(leases: Leases) -> list[dict[str, Any]]:
     if count < 2:
         return []
     contexts = (context for number in range(count) for context in seen(leases, number, _VIEWS))
-    courses = [np.abs(simulated(context, context.params)).sum(axis=(2, 3)).ravel() for context in contexts]
+    courses = [np.abs(simulated(context, context.params).voxels).sum(axis=(2, 3)).ravel() for context in contexts]
     with np.errstate(divide="ignore", invalid="ignore"):  # of a constant course, nothing correlates
         alike = np.nan_to_num(np.corrcoef(np.array(courses, np.float64)))
     lease, view = np.divmod(np.arange(len(alike)), _VIEWS)
@@ -159,10 +210,11 @@ def making(leases: Leases, samples_per_decode: int) -> Callable[[int], None]:
 
     def make(number: int) -> None:
         lease = leases.each[number % len(leases.each)]
+        job = SampleJob.of(lease)
         for first in range(0, _VIEWS, samples_per_decode):
             indices = lease.indices[first : first + samples_per_decode]
-            for index, decoded in zip(indices, decode_for(lease, indices, Folder(leases.root)), strict=True):
-                make_sample(dataclasses.replace(lease, indices=(index,)), decoded)
+            for index, decoded in zip(indices, decode_for(job.clip, indices, Folder(leases.root)), strict=True):
+                make_sample(dataclasses.replace(job, index=index), decoded)
 
     return make
 

@@ -18,7 +18,9 @@ THRESHOLDS = (0.05, 0.2, 0.5, 1.0, 2.0)
 """Contrast thresholds at which errors are measured."""
 ERROR_THRESHOLD = 0.2
 ERROR_KEY = f"voxel_error_at_{ERROR_THRESHOLD:g}"
-"""The error that settings are judged by."""
+"""The error of a form."""
+MOTION_KEY = "voxel_error_at_twice_the_motion"
+"""The error of a clip's frames; with ERROR_KEY what settings are judged by."""
 
 Record = Mapping[str, Any]
 Costs = tuple[float, ...]
@@ -42,7 +44,9 @@ _SETTINGS: _Columns = (
     ("cpu_seconds_per_sample", "CPU s/batch", "{:.2f}", BATCH),
     ("bytes_ratio", "x disk", "{:.2f}", 1),
     ("bytes_per_video_second", "MB/s", "{:.2f}", 1e-6),
-    (ERROR_KEY, f"voxels {ERROR_THRESHOLD:g}", "{:.2f}", 100),
+    (ERROR_KEY, "form", "{:.2f}", 100),
+    (MOTION_KEY, "2 x motion", "{:.2f}", 100),
+    ("count_error_at_twice_the_motion", "count", "{:+.2f}", 100),
     ("dominated_by", "dominated by", "{}", 1),
 )
 _DIVERSITY: _Columns = (
@@ -68,7 +72,7 @@ def dominators(costs: Mapping[str, Costs]) -> dict[str, str | None]:
 
 def name_dominated(records: Sequence[dict[str, Any]]) -> None:
     """Add to each setting's record a setting that dominates it in speed, errors, diversity and disk space, or None."""
-    keys = ("cpu_seconds_per_sample", ERROR_KEY, "samples_per_decode", "bytes_per_video_second")
+    keys = ("cpu_seconds_per_sample", ERROR_KEY, MOTION_KEY, "samples_per_decode", "bytes_per_video_second")
     # Without events there is no relative error, and no form is worse than another.
     found = dominators(
         {r["name"]: tuple(math.inf if r[key] is None else float(r[key]) for key in keys) for r in records}
@@ -77,12 +81,17 @@ def name_dominated(records: Sequence[dict[str, Any]]) -> None:
         record["dominated_by"] = found[record["name"]]
 
 
+def error_of(record: Record) -> float:
+    """Return the larger of a setting's two errors; 0 where there are no events."""
+    return max(record[ERROR_KEY] or 0.0, record[MOTION_KEY] or 0.0)
+
+
 def best(records: Sequence[Record], *, target_rate: float | None, max_error: float | None) -> Record:
     """Return the setting to take.
 
     Args:
-        records: of the settings; each has "samples_per_core_second", "samples_per_decode" and ERROR_KEY, which is None
-            where there are no events.
+        records: of the settings; each has "samples_per_core_second", "samples_per_decode", ERROR_KEY and MOTION_KEY,
+            which are None where there are no events. The larger of both is its error.
         target_rate: samples a core second. Take the smallest error at this rate or above; of equals the fewest samples
             per decode, then the fastest.
         max_error: without ``target_rate``, the largest error. Take the fastest within it; of equals the fewest samples
@@ -98,10 +107,10 @@ def best(records: Sequence[Record], *, target_rate: float | None, max_error: flo
             raise UsageError(
                 f"--target-rate {target_rate:g}: the fastest setting makes {most:.3g} samples a core second"
             )
-        return min(fit, key=lambda r: (r[ERROR_KEY] or 0.0, r["samples_per_decode"], -r["samples_per_core_second"]))
-    fit = [record for record in records if max_error is None or (record[ERROR_KEY] or 0.0) <= max_error]
+        return min(fit, key=lambda r: (error_of(r), r["samples_per_decode"], -r["samples_per_core_second"]))
+    fit = [record for record in records if max_error is None or error_of(record) <= max_error]
     if not fit:
-        least = min(record[ERROR_KEY] for record in records)
+        least = min(map(error_of, records))
         raise UsageError(f"--max-error {max_error:g}: the smallest error of a setting is {least:.3g}")
     return min(fit, key=lambda r: (-r["samples_per_core_second"], r["samples_per_decode"]))
 
@@ -130,8 +139,9 @@ def tables(records: Sequence[Record]) -> str:
     ]  # fmt: skip
     ways = list({record["way"]: record for record in reversed(of["setting"])}.values())[::-1]
     about = (
-        f"CPU s/batch: of {BATCH} samples; x disk: of the source; MB/s: of video; voxels: error against the full "
-        "model, per cent\n"
+        f"CPU s/batch: of {BATCH} samples; x disk: of the source; MB/s: of video. Errors in per cent at c = "
+        f"{ERROR_THRESHOLD:g}: form, voxels against the same setting from exactly decoded frames; 2 x motion, "
+        "voxels of every second frame against those of all frames; count, its number of events\n"
     )
     parts = [format_table(listed, _SETTINGS) + about, format_table([*ways, *of["scale"]], _ERRORS)]
     if of["diversity"]:

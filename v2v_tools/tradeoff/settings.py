@@ -61,6 +61,11 @@ class ServeSetting:
         return ", ".join((self.form, *self.values))
 
     @property
+    def exact(self) -> ServeSetting:
+        """Return the same from exactly decoded frames: what a store or another encoding is judged by."""
+        return dataclasses.replace(self.single, form=SOURCE)
+
+    @property
     def single(self) -> ServeSetting:
         """Return the setting of one sample a decode, whose samples have the same bytes."""
         return dataclasses.replace(self, spec=dataclasses.replace(self.spec, samples_per_decode=1, sibling_spacing=0))
@@ -122,11 +127,22 @@ def settings(forms: Sequence[str], spec: StreamSpec, varied: Axes) -> list[Serve
     return [ServeSetting(form, *stream) for form in (SOURCE, *forms) for stream in streams]
 
 
-def full_model(setting: ServeSetting, compared: Sequence[ServeSetting]) -> ServeSetting:
-    """Return what a setting is judged by: the source, with the shortest sub-steps of all that are compared."""
-    finest = min((each.spec.substep_px for each in compared if each.spec.substep_px), default=0.0)
-    single = setting.single
-    return ServeSetting(SOURCE, dataclasses.replace(single.spec, substep_px=finest))
+def halves(spec: StreamSpec) -> tuple[StreamSpec, StreamSpec]:
+    """Return two streams of the same sequences: one of all frames without sub-steps, one with every second frame left
+    out. Nothing in them is random but the crop: no noise, no pauses. Grids are counted in frames, and there are two
+    at least, so that they can be halved.
+
+    Raises:
+        UsageError: ``frame_stride`` cannot be doubled.
+    """
+    recipe = spec.recipe
+    count = max(1, recipe.voxels_per_clip // 2)
+    both = recipe.replace(
+        voxels_per_clip=2 * count, lead_frames=0, lead_voxels=0, voxel_seconds=(0.0, 0.0), noise_sigma=(0.0, 0.0),
+        hot_pixel_share=(0.0, 0.0), shot_noise_hz=(0.0, 0.0), leak_hz=(0.0, 0.0), pause_probability=0.0,
+    )  # fmt: skip
+    half = both.replace(voxels_per_clip=count, frame_stride=2 * recipe.frame_stride)
+    return dataclasses.replace(spec, recipe=both, substep_px=0.0), dataclasses.replace(spec, recipe=half)
 
 
 def _changed(spec: StreamSpec, key: str, value: str) -> StreamSpec:

@@ -13,7 +13,7 @@ import pytest
 from bench.__main__ import main
 from bench.chaos import chaos
 from bench.chaos.faults import Fault
-from bench.chaos.fleet import Fleet
+from bench.chaos.fleet import Fleet, port_file
 from tests.clips import write_panned
 from tests.leftovers import abandoned_memory, shared_memory
 
@@ -33,8 +33,8 @@ def test_what_is_left_over_is_found(tmp_path: Path) -> None:
     assert fleet.traces() == []
     (fleet.tmp / "forgotten").write_text("x", encoding="utf-8")
     (fleet.cache / "index.sqlite-wal").write_text("x", encoding="utf-8")
-    fleet.port_file.write_text("x", encoding="utf-8")
-    assert fleet.traces() == ["file tmp/forgotten", "file index.sqlite-wal", "the port file"]
+    port_file(fleet.server).write_text("x", encoding="utf-8")
+    assert fleet.traces() == ["file tmp/forgotten", "file index.sqlite-wal", "the port file of server"]
 
 
 @pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="this host has no /dev/shm")
@@ -55,10 +55,11 @@ def test_shared_memory_is_left_over_once_nobody_maps_it() -> None:
 
 
 @pytest.mark.slow
-def test_a_short_run_keeps_the_promise(tmp_path: Path) -> None:
+@pytest.mark.parametrize("brokers", [1, 2])
+def test_a_short_run_keeps_the_promise(brokers: int, tmp_path: Path) -> None:
     clips = write_panned(tmp_path / "clips", 6, 201, 128, 160)
     out = tmp_path / "chaos.json"
-    flags = ["--minutes", "0.5", "--every", "1.5", "--remakes", "60", "--seed", "3"]
+    flags = ["--minutes", "0.5", "--every", "1.5", "--remakes", "60", "--seed", "3", "--brokers", str(brokers)]
     status = main(["chaos", "--videos", str(clips), *flags, "--keep", str(tmp_path / "run"), "--json", str(out)])
     (record,) = json.loads(out.read_text(encoding="utf-8"))
     assert {key: record[key] for key in chaos.FAILING} == dict.fromkeys(chaos.FAILING, 0)

@@ -9,8 +9,8 @@ from bench.speed.null_workers import answer
 from tests.server.named_corpus import SMALL_SPEC, corpus, video
 from v2v_protocol.messages import decode_map, decode_sample
 from v2v_protocol.sample import DEFAULT_ARRAYS, Form, Provenance, SampleId, array_layout
-from v2v_server.broker.dispatcher import check_result
 from v2v_server.broker.leases import Request
+from v2v_server.broker.workers import check_result
 from v2v_server.schedule import Schedule, SequenceTable
 from v2v_tools.remake import lease_for
 

@@ -53,18 +53,18 @@ def _disconnect() -> None:
 def _install(fault: dict) -> None:
     from v2v_server.store.video_file import VideoFile
     from v2v_server.worker import process as worker
-    from v2v_server.worker import produce
+    from v2v_server.worker.making import make, read
 
     at = {"video": ""}
-    decode_for, simulate_clip = worker.decode_for, produce.simulate_clip
+    decode_for, simulate_clip = read.decode_for, make.simulate_clip
     sample_message, confine = worker.sample_message, worker.confine
     folder = Path(fault.get("once", "/nowhere")).parent
     # A confined worker may write to no folder but its cache.
     worker.confine = lambda written, **more: confine(written and [*written, folder], **more)
 
-    def decoding(lease, *rest):
-        at["video"] = lease.video
-        return decode_for(lease, *rest)
+    def decoding(clip, *rest):
+        at["video"] = clip.video
+        return decode_for(clip, *rest)
 
     def before(stage, function):
         def call(*arguments, **named):
@@ -74,9 +74,9 @@ def _install(fault: dict) -> None:
 
         return call
 
-    worker.decode_for = decoding
+    read.decode_for = decoding
     VideoFile.clips = before("decode", VideoFile.clips)
-    produce.simulate_clip = before("simulate", simulate_clip)
+    make.simulate_clip = before("simulate", simulate_clip)
     worker.sample_message = before("send", sample_message)
 
 

@@ -6,7 +6,6 @@ import os
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 
@@ -21,7 +20,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux name
 as_root = pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="acts as another user: as root")
 
 SERVER = """
-import os, sys, zmq
+import os, sys, threading, zmq
 context, user, address = zmq.Context(), int(sys.argv[1]), sys.argv[2]
 if user != os.geteuid():
     os.setgroups([])
@@ -31,6 +30,15 @@ router = context.socket(zmq.ROUTER)
 router.setsockopt(zmq.LINGER, 0)
 router.setsockopt(zmq.IPV6, 1)
 router.setsockopt(zmq.HANDSHAKE_IVL, 1000)
+events = router.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL)
+def report():
+    before = 0
+    while True:
+        event = int.from_bytes(events.recv_multipart()[0][:2], sys.byteorder)
+        if before == zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL and event == zmq.EVENT_ACCEPTED:
+            print("accepted again", file=sys.stderr, flush=True)
+        before = event
+threading.Thread(target=report, daemon=True).start()
 router.bind(address)
 print("listening", flush=True)
 while True:
@@ -47,9 +55,14 @@ class Server:
 
     def __init__(self, user: int, address: str) -> None:
         command = [sys.executable, "-c", SERVER, str(user), address]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         assert self.process.stdout is not None
         assert self.process.stdout.readline() == "listening\n"
+
+    def accept_again(self) -> None:
+        """Wait until it has given up a handshake and accepted the next connection."""
+        assert self.process.stderr is not None
+        assert self.process.stderr.readline() == "accepted again\n"
 
     def stop(self) -> str:
         """Return what it received."""
@@ -134,7 +147,9 @@ def test_nor_does_one_that_takes_the_port_later(serve: Callable[[int, str], Serv
         link.send([b"secret of before"])
         second = serve(12345, address)
         link.send([b"secret"])
-        time.sleep(0.5)  # ZeroMQ connects by itself, and asks; nothing is answered before this peer looks
+        assert link._questions.poll(
+            60_000
+        )  # ZeroMQ has connected by itself; nothing is answered before this peer looks
         with pytest.raises(UsageError, match="belongs to user 12345"):
             use(link, handshakes=2)
         assert second.stop() == ""
@@ -148,7 +163,8 @@ def test_a_connection_to_a_server_that_comes_back_is_made_again(
         link.connect()
         for number in range(2):
             server = serve(os.geteuid(), address)
-            time.sleep(2.5 * number)
+            if number:
+                server.accept_again()
             use(link, handshakes=number + 1)
             link.send([b"%d" % number])
             assert server.process.stdout is not None
@@ -171,6 +187,8 @@ def test_the_question_of_a_connection_that_has_ended_is_not_answered_to_the_next
             first.sendall(GREETING)
             assert link._questions.poll(60_000)
         with listening.accept()[0] as second:
+            second.settimeout(60.0)
+            second.recv(1, socket.MSG_PEEK)  # ZeroMQ has told of the connection before it speaks
             link.has_reconnected()  # reads the question of the first
             second.sendall(GREETING)
             assert link._questions.poll(60_000)

@@ -40,11 +40,14 @@ from v2v_protocol.messages import (
     encode_sample,
 )
 from v2v_protocol.sample import Form
-from v2v_server.broker import dispatcher as dispatcher_module
-from v2v_server.broker.dispatcher import MOST_BATCH_SIZE, MOST_FAULTS, MOST_TABLES, check_result, work_seconds
+from v2v_server.broker import consumers, workers
+from v2v_server.broker.admission import MOST_BATCH_SIZE, MOST_TABLES
+from v2v_server.broker.assignment import work_seconds
+from v2v_server.broker.consumers import MOST_FAULTS
 from v2v_server.broker.leases import REST_SECONDS, SILENCE_SECONDS, Cause, Loss, Request
 from v2v_server.broker.session import GONE_SECONDS, SILENT_SECONDS
 from v2v_server.broker.state import AddToQuarantine, Disconnect, ToConsumer
+from v2v_server.broker.workers import check_result
 from v2v_server.quarantine import Quarantine, QuarantineEntry
 from v2v_server.schedule import MOST_CANDIDATES
 from v2v_server.video.frame_index import FrameIndex
@@ -79,7 +82,7 @@ def test_a_sample_goes_from_want_to_answer() -> None:
     assert at.samples() == [(3, 7)]
     # The very objects: the header is read, nothing is copied.
     assert [id(frame) for frame in at.frames[b"c"][-1]] == [id(frame) for frame in payload]
-    counters = at.dispatcher.counters
+    counters = at.broker.counters
     assert (counters.samples, counters.batches, counters.cpu_seconds) == (1, 0.25, 0.1)
     assert counters.bytes == sum(len(frame) for frame in payload[1:])
     assert counters.faults == 0
@@ -125,7 +128,7 @@ def test_a_refused_hello_names_its_reason(
 ) -> None:
     at = peers(corpus(*(video(f"v{number}.mp4", height_px=200, width_px=200) for number in range(5))))
     assert text in refused(at.consumer_says(b"c", Hello(spec, arrays, batch_size, 0)), ErrorCode.SPEC)
-    assert len(at.dispatcher.sessions) == 0
+    assert len(at.broker.sessions) == 0
 
 
 def test_over_credit_and_out_of_range_take_nothing() -> None:
@@ -158,7 +161,7 @@ def test_credit_counts_workers_that_are_still_starting() -> None:
 
 
 def test_a_full_server_is_busy_to_newcomers_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dispatcher_module, "MOST_SESSIONS", 3)
+    monkeypatch.setattr(consumers, "MOST_SESSIONS", 3)
     at = peers()
     for identity in (b"c1", b"c2", b"c3"):
         at.hello(identity)
@@ -169,13 +172,13 @@ def test_a_full_server_is_busy_to_newcomers_only(monkeypatch: pytest.MonkeyPatch
     at.hello(b"c2", seed=1)
     at.consumer_says(b"c3", Goodbye())
     at.hello(b"c4")
-    assert len(at.dispatcher.sessions) == 3
+    assert len(at.broker.sessions) == 3
     at.now += SILENT_SECONDS
     at.consumer_says(b"c2", Ping())
     at.consumer_says(b"c4", Ping())
     at.dispatcher.consumer_gone(b"c4", at.now)
     at.hello(b"c5")
-    assert {session.identity for session in at.dispatcher.sessions} == {b"c2", b"c5"}
+    assert {session.identity for session in at.broker.sessions} == {b"c2", b"c5"}
 
 
 # --- workers that die, hang or fail -----------------------------------------------------------------------------------
@@ -194,9 +197,9 @@ def test_a_worker_that_leaves_gives_its_work_to_others_without_blame(how: str, l
         assert f"version {NUMERICS_VERSION + 1}, the server's is {NUMERICS_VERSION}" in text
     else:
         for _ in range(3):
-            at.carry_out(at.dispatcher.worker_unreachable(b"w1", 0.0))
-            at.carry_out(at.dispatcher.worker_unreachable(b"never there", 0.0))
-    assert (at.dispatcher.workers, at.dispatcher.counters.workers_lost) == (1, lost)
+            at.carry_out(at.dispatcher.worker_gone(b"w1", 0.0))
+            at.carry_out(at.dispatcher.worker_gone(b"never there", 0.0))
+    assert (at.broker.workers, at.broker.counters.workers_lost) == (1, lost)
     assert at.leases[b"w2"][0].candidate == 0
     at.work_off(b"w2")
     assert at.samples() == [(0, 0)]
@@ -223,7 +226,7 @@ def test_a_video_that_only_the_workers_host_lacks_is_made_elsewhere() -> None:
     for name in (b"w1", b"w2"):
         at.work_off(name)
     assert sorted(at.samples()) == [(0, 3), (0, 4), (0, 5), (0, 6)]
-    counters = at.dispatcher.counters
+    counters = at.broker.counters
     assert (counters.missing_videos, counters.refused_candidates, counters.faults) == (1, 0, 1)
 
 
@@ -258,7 +261,7 @@ def test_a_video_that_the_server_lacks_as_well_is_refused() -> None:
     at.fail(reason="changed since it was catalogued", frame=None, here=True)
     (second,) = at.leases[b"w"]
     assert (second.candidate, second.refusals["refusals"][0]["reason"]) == (1, "changed since it was catalogued")
-    assert at.dispatcher.counters.missing_videos == 0
+    assert at.broker.counters.missing_videos == 0
 
 
 def test_a_failed_video_is_passed_over_and_the_next_lease_says_so() -> None:
@@ -274,7 +277,7 @@ def test_a_failed_video_is_passed_over_and_the_next_lease_says_so() -> None:
     assert [refusal["reason"] for refusal in third.refusals["refusals"]] == ["no frame", "nor here"]
     at.work_off()
     assert at.samples() == [(0, 3)]
-    assert at.dispatcher.counters.refused_candidates == 2
+    assert at.broker.counters.refused_candidates == 2
     at.hello(on_bad_video="raise")
     at.want(4)
     at.fail(reason="no substitute")
@@ -293,7 +296,7 @@ def test_when_every_candidate_fails_the_consumer_hears_the_whole_story_once() ->
         assert f"{name} at frame 7: reason {number}" in message.text
     assert not at.leases[b"w"]
     assert at.samples() == []
-    assert at.dispatcher.counters.unavailable == 1
+    assert at.broker.counters.unavailable == 1
     # The credit is free again.
     assert at.want(0, 1) == []
 
@@ -326,7 +329,7 @@ def test_an_index_that_another_process_holds_is_no_videos_fault() -> None:
     assert [lease.indices[0] for lease in at.leases[b"w"]] == list(range(8))  # again in their order
     assert not any(lease.candidate for lease in at.leases[b"w"])
     assert not trouble(at)
-    assert not at.dispatcher.counters.refused_candidates
+    assert not at.broker.counters.refused_candidates
 
 
 def test_an_overdue_worker_is_given_up_and_its_work_goes_to_another() -> None:
@@ -337,12 +340,12 @@ def test_an_overdue_worker_is_given_up_and_its_work_goes_to_another() -> None:
     at.join(b"w2")
     at.tick(0.5)
     assert at.given_up == [b"w1"]
-    assert at.dispatcher.workers == 1
+    assert at.broker.workers == 1
     # Only the lease in work is blamed.
     assert [(lease.indices, lease.candidate) for lease in at.leases[b"w2"]] == [((0,), 1), ((1,), 0)]
     at.tick(1.0)
     assert at.given_up == [b"w1"]
-    assert (at.dispatcher.counters.workers_lost, at.dispatcher.counters.returned_leases) == (1, 2)
+    assert (at.broker.counters.workers_lost, at.broker.counters.returned_leases) == (1, 2)
     # Its answer comes after all: too late.
     at.finish(b"w1")
     assert at.samples() == []
@@ -363,8 +366,8 @@ def test_a_worker_that_fell_silent_is_given_up_once_without_blame() -> None:
     at.tick(0.5)
     assert at.given_up == [b"w2"]
     at.tick(0.5)
-    assert (at.given_up, at.dispatcher.workers) == ([b"w2"], 1)
-    assert (at.recorded, at.dispatcher.counters.workers_lost) == ([], 1)
+    assert (at.given_up, at.broker.workers) == ([b"w2"], 1)
+    assert (at.recorded, at.broker.counters.workers_lost) == ([], 1)
     # A worker with a lease may be silent until its deadline; any message counts as a sign of life.
     at.finish(b"w1")
     at.worker_says(b"w1", Ping())
@@ -384,9 +387,9 @@ def test_a_consumer_that_pings_is_not_forgotten() -> None:
     for _ in range(4):
         at.tick(IDLE - 1)
         at.consumer_says(b"c", Ping())
-    assert len(at.dispatcher.sessions) == 1
+    assert len(at.broker.sessions) == 1
     at.tick(IDLE + 1)
-    assert len(at.dispatcher.sessions) == 0
+    assert len(at.broker.sessions) == 0
 
 
 def test_geometries_requested_once_are_evicted() -> None:
@@ -394,7 +397,7 @@ def test_geometries_requested_once_are_evicted() -> None:
     alive = []
     for number in range(3 * MOST_TABLES):
         at.hello(max_sequences_per_video=number + 1)
-        session = at.dispatcher.sessions.get(b"c")
+        session = at.broker.sessions.get(b"c")
         assert session is not None
         alive.append(weakref.ref(session.schedule.table))
     del session
@@ -447,17 +450,17 @@ def test_a_consumer_whose_connection_ended_has_a_moment_to_come_back() -> None:
         at.hello(name)
         at.dispatcher.consumer_gone(name, at.now)
     at.tick(GONE_SECONDS - 1)
-    assert len(at.dispatcher.sessions) == 2
+    assert len(at.broker.sessions) == 2
     at.consumer_says(b"comes back", Ping())
     at.tick(2.0)
-    assert [session.identity for session in at.dispatcher.sessions] == [b"comes back"]
+    assert [session.identity for session in at.broker.sessions] == [b"comes back"]
 
 
 def test_hello_again_resets_no_credit_and_no_debt() -> None:
     """Repeated ten times a second it took the workers from everybody else."""
     at = peers()
     at.hello(batch_size=1, seed=1)
-    session = at.dispatcher.sessions.get(b"c")
+    session = at.broker.sessions.get(b"c")
     assert session is not None
     credit = session.credit
     at.join(credit=64)
@@ -477,7 +480,7 @@ def test_a_slow_spec_gets_the_time_it_needs_and_does_not_count_against_others() 
     at = peers(corpus(video("v.mp4", width_px=3840, height_px=2160)))
     at.hello(b"slow", on_bad_video="raise")
     at.hello(b"quick")
-    lone = at.dispatcher.sessions.get(b"slow")
+    lone = at.broker.sessions.get(b"slow")
     assert lone is not None
     sequence = lone.schedule.candidate(0, 0, 0, 0)
     plain = work_seconds(lone.spec, ("voxels",), sequence.video)
@@ -521,7 +524,7 @@ def test_garbage_is_counted_and_answered(frames: list[bytes]) -> None:
     at.carry_out(at.dispatcher.from_worker(b"w", frames, 0.0))
     at.carry_out(at.dispatcher.from_consumer(b"stranger", frames, 0.0))
     at.carry_out(at.dispatcher.from_worker(b"stranger", frames, 0.0))
-    assert at.dispatcher.counters.malformed == 4
+    assert at.broker.counters.malformed == 4
     for answer in (at.refusals(b"c")[0], at.refusals(b"stranger")[0], at.told[b"w"][0], at.told[b"stranger"][0]):
         assert isinstance(answer, Denied)
         assert answer.code in (ErrorCode.MALFORMED, ErrorCode.VERSION)
@@ -559,7 +562,7 @@ def test_absurd_costs_neither_stop_nor_unbalance(cpu_seconds: float) -> None:
     at.finish(cpu_seconds=cpu_seconds)
     at.work_off()
     assert len(at.samples(b"c")) == len(at.samples(b"d")) == 8
-    assert 0.0 <= at.dispatcher.counters.cpu_seconds < 1e6
+    assert 0.0 <= at.broker.counters.cpu_seconds < 1e6
 
 
 def _shortened(frames: list[Any]) -> list[Any]:
@@ -583,13 +586,13 @@ NONSENSE: dict[str, Callable[[], list[Any]]] = {
 
 
 def test_there_is_a_limit_to_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dispatcher_module, "MOST_WORKERS", 2)
+    monkeypatch.setattr(workers, "MOST_WORKERS", 2)
     at = peers()
     for name in (b"a", b"b", b"c"):
         at.join(name)
     assert refused(at.told[b"c"], ErrorCode.BUSY) == "this server has 2 workers, its limit"
     at.join(b"a")  # one that is known says hello again
-    assert at.dispatcher.workers == 2
+    assert at.broker.workers == 2
 
 
 @pytest.mark.parametrize("wrong", NONSENSE)
@@ -598,8 +601,8 @@ def test_a_worker_that_answers_nonsense_is_dropped_at_once_and_its_work_keeps_it
     lease = at.begin()
     at.worker_says(b"w", Result(lease.lease), *NONSENSE[wrong]())
     assert at.samples() == []
-    counters = at.dispatcher.counters
-    assert (counters.malformed, counters.workers_lost, at.dispatcher.workers) == (1, 1, 0)
+    counters = at.broker.counters
+    assert (counters.malformed, counters.workers_lost, at.broker.workers) == (1, 1, 0)
     refused(at.told[b"w"], ErrorCode.MALFORMED)
     # Whatever else it says, the server does not know it any more.
     at.worker_says(b"w", Result(lease.lease + 1), *sample_frames(0, 1))

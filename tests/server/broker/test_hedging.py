@@ -37,7 +37,7 @@ def slowed() -> tuple[Peers, Lease, Lease]:
     (second,) = at.leases[b"fast"]
     assert (first.arena, first.slot) == (ARENA, 5)
     assert second == replace(first, lease=second.lease, arena="", slot=NO_SLOT)  # the first may still write to it
-    assert at.dispatcher.counters.second_leases == 1
+    assert at.broker.counters.second_leases == 1
     return at, first, second
 
 
@@ -50,8 +50,8 @@ def test_the_first_answer_is_delivered_and_the_second_dropped(order: tuple[bytes
     assert at.heard[b"c"][-1].slot == (5 if order[0] == b"slow" else NO_SLOT)  # type: ignore[union-attr]
     at.finish(order[1])
     assert at.samples() == [*before, (0, 20)]
-    assert at.dispatcher.counters.late_results == 1
-    assert len(at.dispatcher.leases) == 0
+    assert at.broker.counters.late_results == 1
+    assert len(at.broker.leases) == 0
     # And the room of both is free again.
     at.want(21, 22, 23, 24)
     assert (len(at.leases[b"slow"]), len(at.leases[b"fast"])) == (1, 2)
@@ -71,7 +71,7 @@ def test_a_lone_task_has_no_twin() -> None:
     at.join(b"idle")
     at.tick(20.0)
     assert not at.leases[b"idle"]
-    assert at.dispatcher.counters.second_leases == 0
+    assert at.broker.counters.second_leases == 0
 
 
 def test_a_twin_is_of_the_snapshot_of_the_first_though_a_verdict_fell_meanwhile() -> None:

@@ -1,16 +1,17 @@
 """The promise against any interleaving: consumers and workers that come, go, die, hang, fail, repeat themselves and are
-late, on a server whose quarantine can sometimes not be written."""
+late, on a server whose quarantine can sometimes not be written, and whose index is at times locked or damaged."""
 
 from __future__ import annotations
 
 import random
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 
 import hypothesis.strategies as st
 from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
+from tests.server.named_corpus import corpus, video
 from tests.server.peers import CREDIT, DEADLINE, peers, sample_frames
 from v2v_client.memory import Slots
 from v2v_protocol.arena import NO_SLOT, ArenaName, Slot
@@ -26,10 +27,11 @@ from v2v_protocol.messages import (
     Unavailable,
     decode_map,
 )
-from v2v_server.broker.dispatcher import TOO_LARGE_SECONDS
+from v2v_server.broker.assignment import TOO_LARGE_SECONDS
 from v2v_server.broker.leases import Cause, runs_alone
 
 _HALF_WRITTEN = (-1, -1, -1)
+VIDEOS = tuple(f"v{number}.mp4" for number in range(5))
 
 
 class Interleaving(RuleBasedStateMachine):
@@ -44,16 +46,20 @@ class Interleaving(RuleBasedStateMachine):
     @initialize(
         remote=st.sets(names),
         lethal=st.dictionaries(st.sampled_from(("v0.mp4", "v1.mp4")), st.sampled_from(list(Cause)), min_size=1),
+        damaged=st.sets(st.just("v2.mp4")),
     )
-    def start(self, remote: set[bytes], lethal: dict[str, Cause]) -> None:
+    def start(self, remote: set[bytes], lethal: dict[str, Cause], damaged: Set[str] = frozenset()) -> None:
         """A server at work: it is known how long samples usually take, two consumers have asked for more, and two
         workers are there.
 
         Args:
             remote: workers whose processes cannot be ended.
             lethal: videos that end the worker that begins one, and how it ends; a hung one stays silent.
+            damaged: videos whose index is damaged.
         """
-        self.at = peers(share_bytes=self.share_bytes)
+        self.locked: set[str] = set()
+        videos = corpus(*map(video, VIDEOS), unreadable=tuple(damaged), held=self.locked)
+        self.at = peers(videos, share_bytes=self.share_bytes)
         self.at.remote = remote
         self.lethal = lethal
         self.stuck: set[bytes] = set()
@@ -238,12 +244,12 @@ class Interleaving(RuleBasedStateMachine):
         if how == "goodbye":
             self.at.worker_says(identity, Goodbye())
         elif how == "unreachable" or not held:
-            self.at.carry_out(self.at.dispatcher.worker_unreachable(identity, self.at.now))
+            self.at.carry_out(self.at.dispatcher.worker_gone(identity, self.at.now))
         else:
             self.at.worker_says(identity, Result(held[0].lease), b"nonsense")
-            if self.at.dispatcher.sessions.get(self.at.asked_by(held[0])) is not None:
-                self.at.carry_out(self.at.dispatcher.worker_unreachable(identity, self.at.now))
-        self.at.carry_out(self.at.dispatcher.worker_unreachable(identity, self.at.now))
+            if self.at.broker.sessions.get(self.at.asked_by(held[0])) is not None:
+                self.at.carry_out(self.at.dispatcher.worker_gone(identity, self.at.now))
+        self.at.carry_out(self.at.dispatcher.worker_gone(identity, self.at.now))
         self.late += [(identity, lease) for lease in held]
         self._listen()
 
@@ -275,6 +281,27 @@ class Interleaving(RuleBasedStateMachine):
     def disk(self, writable: bool) -> None:
         self.at.writable = writable
 
+    @rule(is_locked=st.booleans())
+    def index(self, is_locked: bool) -> None:
+        """Another process locks the index, or lets it go."""
+        self.locked.update(VIDEOS if is_locked else ())
+        if not is_locked:
+            self.locked.clear()
+
+    @invariant()
+    def every_lease_is_sent(self) -> None:
+        """And shows the sequence of its candidate."""
+        at = getattr(self, "at", None)
+        if at is None:
+            return
+        for identity in at.broker.registry.members:
+            held = at.leases.get(identity, ())
+            assert at.broker.leases.held.get(identity, []) == sorted(lease.lease for lease in held)
+            for lease in held:
+                request = at.broker.leases.request(lease.lease, identity)
+                if request is not None:
+                    assert at.broker.clip_of(request) == (lease.video, lease.start_frame)
+
     @invariant()
     def bounded(self) -> None:
         at = getattr(self, "at", None)
@@ -282,26 +309,27 @@ class Interleaving(RuleBasedStateMachine):
             return
         for held in at.leases.values():
             assert len(held) <= CREDIT * self.spec.get("samples_per_decode", 1)
-        assert {session.identity for session in at.dispatcher.sessions} == set(self.owed)
-        for session in at.dispatcher.sessions:
+        assert {session.identity for session in at.broker.sessions} == set(self.owed)
+        for session in at.broker.sessions:
             assert session.unanswered == self.owed[session.identity]
             assert len(session.unanswered) <= session.credit
             assert 0 <= session.quarantine <= at.quarantine.latest
-        assert at.dispatcher.waiting <= sum(map(len, self.owed.values()))
+        assert at.broker.waiting <= sum(map(len, self.owed.values()))
 
     @invariant()
     def a_lone_request_is_alone(self) -> None:
         at = getattr(self, "at", None)
         if at is None:
             return
-        book = at.dispatcher.leases
-        for identity in list(at.dispatcher.registry.members):
+        book = at.broker.leases
+        for identity in list(at.broker.registry.members):
             lonely = any(runs_alone(request) for request in book.requests_of(identity))
             assert not lonely or book.held_by(identity) == 1
 
     def teardown(self) -> None:
         if not hasattr(self, "at"):
             return
+        self.locked.clear()
         for identity in list(self.at.leases):
             self.at.die(identity)
             self._listen()
@@ -312,6 +340,7 @@ class Interleaving(RuleBasedStateMachine):
         healthy = (b"healthy", b"also healthy")
         for identity in healthy:
             self.at.join(identity)
+        self.at.tick(0.1)  # a locked index is tried again
         while any(self.at.leases[identity] for identity in healthy):
             for identity in healthy:
                 if self.at.leases[identity]:
@@ -322,12 +351,12 @@ class Interleaving(RuleBasedStateMachine):
             self.at.tick(TOO_LARGE_SECONDS)
             self._listen()
         assert not any(self.owed.values())
-        assert self.at.dispatcher.waiting == 0
-        assert not self.at.dispatcher.parked
-        assert len(self.at.dispatcher.leases) == 0
-        assert not self.at.dispatcher.leases.held
-        assert not self.at.dispatcher.leases.out
-        assert set(self.at.dispatcher.leases.durations) <= set(self.owed)
+        assert self.at.broker.waiting == 0
+        assert not self.at.broker.parked
+        assert len(self.at.broker.leases) == 0
+        assert not self.at.broker.leases.held
+        assert not self.at.broker.leases.out
+        assert set(self.at.broker.leases.durations) <= set(self.owed)
 
 
 class OfSiblings(Interleaving):
@@ -366,7 +395,7 @@ class WithSlots(Interleaving):
 
     def want(self, identity: bytes, epoch: int, indices: list[int]) -> None:
         slots = self.slots.setdefault(identity, Slots())
-        session = self.at.dispatcher.sessions.get(identity)
+        session = self.at.broker.sessions.get(identity)
         keys = {epoch * 1000 + index: index for index in indices}
         fresh = {key: index for key, index in keys.items() if key not in slots._named}
         if session is None or len(session.unanswered | {(epoch, index) for index in indices}) > session.credit:
@@ -450,7 +479,7 @@ def walk(seed: int, steps: int, kind: type[Interleaving] = Interleaving) -> Coun
     names = (b"w1", b"w2", b"w3", b"w4")
     model = kind()
     lethal = {"v0.mp4": draw.choice(list(Cause)), "v1.mp4": draw.choice((Cause.UNEXPLAINED, Cause.HUNG))}
-    model.start(set(draw.sample(names, draw.randrange(3))), lethal)
+    model.start(set(draw.sample(names, draw.randrange(3))), lethal, set(draw.sample(VIDEOS[2:], draw.randrange(2))))
     seen: Counter[str] = Counter()
 
     def who() -> bytes:
@@ -473,6 +502,7 @@ def walk(seed: int, steps: int, kind: type[Interleaving] = Interleaving) -> Coun
         "leave": (0.5, lambda: model.leave(who(), draw.choice(("goodbye", "unreachable")))),
         "go": (2, lambda: model.at.leases and model.go(draw.randrange(4), draw.choice(("unreachable", "nonsense")))),
         "disk": (1, lambda: model.disk(draw.random() < 0.7)),
+        "index": (3, lambda: model.index(draw.random() < 0.4)),
     }
     if isinstance(model, WithSlots):
         moves["late_write"] = (10, lambda: model.late_write(draw.randrange(100)))
@@ -481,13 +511,15 @@ def walk(seed: int, steps: int, kind: type[Interleaving] = Interleaving) -> Coun
         _, move = draw.choices(list(moves.values()), weights)[0]
         move()
         model.bounded()
+        model.every_lease_is_sent()
         model.a_lone_request_is_alone()
-        book = model.at.dispatcher.leases
+        book = model.at.broker.leases
+        seen["blocked"] += bool(model.at.broker.blocked_reason)
         seen["lone at work"] += any(map(runs_alone, (request for name in names for request in book.requests_of(name))))
-        seen["lone waiting"] += any(runs_alone(clip.requests[0]) for clip in model.at.dispatcher.parked)
-    seen["twins"] = model.at.dispatcher.counters.second_leases
+        seen["lone waiting"] += any(runs_alone(clip.requests[0]) for clip in model.at.broker.parked)
+    seen["twins"] = model.at.broker.counters.second_leases
     seen["verdicts"] = len(model.at.recorded)
-    seen["samples"] = model.at.dispatcher.counters.samples
+    seen["samples"] = model.at.broker.counters.samples
     if isinstance(model, WithSlots):
         seen["read in slots"] = model.read_there
         seen["abandoned slots"] = model.abandoned
@@ -503,6 +535,6 @@ def test_long_walks_reach_what_is_rare_and_keep_the_promise() -> None:
     for seed in range(8):
         seen += walk(seed, 150, OfSiblings)
         seen += walk(seed, 150, WithSlots)
-    least = {"lone at work": 10, "lone waiting": 3, "twins": 5, "verdicts": 20, "samples": 500}
+    least = {"lone at work": 10, "lone waiting": 3, "twins": 5, "verdicts": 20, "samples": 500, "blocked": 50}
     least |= {"read in slots": 40, "abandoned slots": 5, "arenas used again": 10}
     assert {state: seen[state] for state in least if seen[state] < least[state]} == {}

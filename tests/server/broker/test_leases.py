@@ -377,7 +377,7 @@ def test_the_registry_forgets_removed_workers() -> None:
     table.workers.rest(b"a", 0.0, "a.mp4: not there")
     table.workers.remove(b"a")
     table.workers.remove(b"a")
-    assert (len(table.workers), b"a" in table.workers, table.next()) == (0, False, None)
+    assert (len(table.workers.members), b"a" in table.workers.members, table.next()) == (0, False, None)
     assert not table.workers.mark_heard(b"a", 0.0)
     table.add(b"a", 1, 0.0)  # another process of that name, which has not failed
     assert table.next() == b"a"
@@ -405,12 +405,12 @@ def test_who_has_room_is_what_counting_everybody_says(moves: list[tuple[str, int
     for what, which, how in moves:
         name, session = f"w{which}", b"cd"[how % 2 :][:1]
         identity = name.encode()
-        if what == "add" and identity not in table.workers:
+        if what == "add" and identity not in table.workers.members:
             table.add(identity, 1 + how, 0.0)
         elif what == "remove":
             table.workers.remove(identity)
             table.book.lost(identity)
-        elif what in ("load", "load alone") and identity in table.workers and not lonely(table, identity):
+        elif what in ("load", "load alone") and identity in table.workers.members and not lonely(table, identity):
             out.append((table.load(name, deaths=ALONE_AFTER * (what == "load alone"), session=session), identity))
         elif what == "finish" and out:
             table.book.finished(*out.pop(which % len(out)), 0.0)
@@ -426,7 +426,7 @@ def test_who_has_room_is_what_counting_everybody_says(moves: list[tuple[str, int
             (table.book.held_by(identity), identity)
             for identity, worker in table.workers.members.items()
             if not worker.given_up
-            and not table.workers.is_resting(identity)
+            and identity not in table.workers.resting
             and table.book.held_by(identity) < worker.credit
             and not lonely(table, identity)
         )

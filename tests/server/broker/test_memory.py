@@ -8,9 +8,9 @@ from tests.server.named_corpus import SMALL_SPEC, corpus, video
 from tests.server.peers import Peers, peers
 from v2v_protocol.messages import Ping, Pong
 from v2v_protocol.sample import array_layout, layout_bytes
-from v2v_server.broker.dispatcher import TOO_LARGE_SECONDS
+from v2v_server.broker.assignment import TOO_LARGE_SECONDS
 from v2v_server.broker.leases import ALONE_AFTER, Cause
-from v2v_server.schedule import LARGEST_MEMORY_BYTES, lease_bytes
+from v2v_server.lease_memory import LARGEST_MEMORY_BYTES, lease_bytes
 
 MIB = 1 << 20
 BIG = video("big.mp4", height_px=2160, width_px=3840)
@@ -59,7 +59,7 @@ def test_siblings_of_a_large_clip_stay_together() -> None:
     at.hello(shuffle=False, samples_per_decode=2, sibling_spacing=1)
     at.want(20, 21)
     at.join(b"small", memory_bytes=SMALL_WORKER)
-    assert at.dispatcher.waiting == 2
+    assert at.broker.waiting == 2
     at.join(b"large", memory_bytes=LARGE_WORKER + MIB)
     assert [lease.indices for lease in at.leases[b"large"]] == [(20, 21), (21,)]
 
@@ -93,7 +93,7 @@ def test_a_clip_that_no_worker_can_hold_is_an_error_of_its_consumer_within_ten_s
     assert error.index == 10
     assert error.text.startswith(said)
     assert at.samples() == [(0, 0)]
-    assert (at.recorded, at.dispatcher.waiting, trouble(at)) == ([], 0, "")
+    assert (at.recorded, at.broker.waiting, trouble(at)) == ([], 0, "")
 
 
 def test_it_waits_for_workers_that_are_to_come_and_says_so_meanwhile() -> None:
@@ -113,7 +113,7 @@ def test_a_worker_that_states_no_limit_has_that_of_all_workers() -> None:
     for stated in (0, LARGEST_MEMORY_BYTES, 2**63):
         at = mixed(10)
         at.join(memory_bytes=stated)
-        assert at.dispatcher.registry.most_memory == LARGEST_MEMORY_BYTES
+        assert at.broker.registry.most_memory == LARGEST_MEMORY_BYTES
         assert videos(at, b"w") == ["big.mp4"]
 
 
@@ -175,8 +175,8 @@ def test_a_worker_is_kept_empty_for_a_lone_clip_only_if_it_can_hold_it() -> None
 def test_a_consumer_that_leaves_takes_its_large_clips_along() -> None:
     at = mixed(10)
     at.join(b"small", memory_bytes=SMALL_WORKER)
-    assert at.dispatcher.waiting == 1
+    assert at.broker.waiting == 1
     at.dispatcher.consumer_lost(b"c")
-    assert at.dispatcher.waiting == 0
+    assert at.broker.waiting == 0
     at.tick(TOO_LARGE_SECONDS)
     assert at.unavailable() == []

@@ -57,11 +57,11 @@ def test_a_hello_that_is_refused_changes_nothing() -> None:
 def test_the_secret_moves_a_session_to_a_new_connection_with_its_debt() -> None:
     at = peers()
     at.consumer_says(b"before", hello(OURS))
-    at.dispatcher.sessions.queue.charge(b"before", 3.0)
+    at.broker.sessions.queue.charge(b"before", 3.0)
     (welcome,) = at.consumer_says(b"after", hello(OURS))
     assert isinstance(welcome, Welcome)
-    (session,) = at.dispatcher.sessions
-    assert (session.identity, at.dispatcher.sessions.queue.balance_ns(b"after")) == (b"after", -3_000_000_000)
+    (session,) = at.broker.sessions
+    assert (session.identity, at.broker.sessions.queue.balance_ns(b"after")) == (b"after", -3_000_000_000)
 
 
 def test_another_key_cannot_act_for_a_session_even_with_its_secret() -> None:
@@ -73,7 +73,7 @@ def test_another_key_cannot_act_for_a_session_even_with_its_secret() -> None:
     assert answer.code == ErrorCode.UNKNOWN_SESSION
     refused(say(at, b"c", hello(OURS), "gpu-2"), ErrorCode.MALFORMED)
     say(at, b"d", hello(OURS), "gpu-2")
-    assert {(session.identity, session.user) for session in at.dispatcher.sessions} == {
+    assert {(session.identity, session.user) for session in at.broker.sessions} == {
         (b"c", "gpu-1"),
         (b"d", "gpu-2"),
     }
@@ -110,7 +110,7 @@ def test_a_worker_that_knows_the_name_of_another_gets_none_of_its_work(
     at.leases[b"1"] = deque(held)
     at.work_off(b"1")
     assert at.samples() == [(0, 0), (0, 1)]
-    assert at.dispatcher.counters.returned_leases == 0
+    assert at.broker.counters.returned_leases == 0
 
 
 def test_the_secret_of_a_worker_moves_its_name_and_returns_its_leases() -> None:
@@ -119,8 +119,8 @@ def test_the_secret_of_a_worker_moves_its_name_and_returns_its_leases() -> None:
     at.consumer_says(b"c", hello(OURS))
     at.want(0, 1)
     assert enter(at, b"2", "worker", OURS) == ""
-    assert list(at.dispatcher.registry.members) == [b"2"]
-    assert at.dispatcher.registry.named("worker") == b"2"
+    assert list(at.broker.registry.members) == [b"2"]
+    assert at.broker.registry.named("worker") == b"2"
     assert len(at.leases[b"2"]) == 2
     at.work_off(b"2")
     assert at.samples() == [(0, 0), (0, 1)]
@@ -130,7 +130,7 @@ def test_no_key_holds_the_name_of_a_worker_of_this_host() -> None:
     at = peers()
     assert enter(at, b"1", "w1-0.1", THEIRS, "gpu-1") == ""
     assert enter(at, b"2", "w1-0.1", OURS) == ""
-    assert list(at.dispatcher.registry.members) == [b"2"]
+    assert list(at.broker.registry.members) == [b"2"]
     assert enter(at, b"1", "w1-0.1", THEIRS, "gpu-1") != ""
 
 

@@ -42,8 +42,8 @@ def test_a_request_for_a_sample_in_work_follows_it(waited: bool) -> None:
     assert len(at.leases[b"w"]) == 1
     at.work_off()
     assert at.samples(b"c") == at.samples(b"d") == [(0, 0)]
-    assert (at.dispatcher.counters.samples, at.dispatcher.counters.shared) == (2, 1)
-    assert at.dispatcher.counters.decodes == 1
+    assert (at.broker.counters.samples, at.broker.counters.shared) == (2, 1)
+    assert at.broker.counters.decodes == 1
 
 
 def test_a_consumer_gets_no_more_shared_samples_than_it_reads() -> None:
@@ -59,7 +59,7 @@ def test_a_consumer_gets_no_more_shared_samples_than_it_reads() -> None:
     assert len(at.samples(b"c")) == 10
     at.carry_out(at.dispatcher.in_flight(b"d", 0, at.now))
     assert sorted(at.samples(b"d")) == [(0, index) for index in range(4)]
-    assert at.dispatcher.counters.decodes == 6
+    assert at.broker.counters.decodes == 6
 
 
 def test_a_finished_sample_is_sent_even_if_no_worker_is_left() -> None:
@@ -70,7 +70,7 @@ def test_a_finished_sample_is_sent_even_if_no_worker_is_left() -> None:
     at.die()
     at.want(0, 1, identity=b"d")
     assert at.samples(b"d") == [(0, 0)]
-    assert at.dispatcher.waiting == 1
+    assert at.broker.waiting == 1
 
 
 def test_other_streams_share_nothing() -> None:
@@ -85,7 +85,7 @@ def test_other_streams_share_nothing() -> None:
     at.carry_out(at.dispatcher.from_consumer(b"k", encode(Want(0, (0,))), at.now, "another key"))
     at.work_off()
     assert all(at.samples(identity) == [(0, 0)] for identity in (b"c", b"d", b"e", b"k"))
-    assert at.dispatcher.counters.shared == 0
+    assert at.broker.counters.shared == 0
 
 
 def test_a_worker_gets_memory_of_the_server_and_consumers_their_own_slot_back() -> None:
@@ -100,7 +100,7 @@ def test_a_worker_gets_memory_of_the_server_and_consumers_their_own_slot_back() 
         answer = at.heard[identity][-1]
         assert isinstance(answer, SampleHeader)
         assert (answer.arena, answer.slot, len(at.frames[identity][-1])) == (lease.arena, number, 1)
-    assert at.dispatcher.counters.in_slots == 2
+    assert at.broker.counters.in_slots == 2
 
 
 @pytest.mark.parametrize("packed", [True, False])
@@ -169,7 +169,7 @@ class Sharing(WithSlots):
     def teardown(self) -> None:
         super().teardown()
         if hasattr(self, "at"):
-            broker = self.at.dispatcher
+            broker = self.at.broker
             assert broker.ring is not None
             assert (broker.makers, broker.followers, broker.ring.being_made) == ({}, {}, {})
 
@@ -183,7 +183,7 @@ def test_long_walks_with_sharing_keep_the_promise() -> None:
     for seed in range(6):
         model = Sharing()
         walk(seed, 120, lambda model=model: model)  # type: ignore[arg-type,misc]
-        seen["shared"] += model.at.dispatcher.counters.shared
+        seen["shared"] += model.at.broker.counters.shared
         seen["read"] += model.read_shared
         seen["dropped"] += model.dropped
     assert all(seen[state] >= 5 for state in ("shared", "read", "dropped")), seen

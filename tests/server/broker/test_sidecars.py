@@ -69,7 +69,7 @@ def test_a_sidecar_that_fails_is_an_error_of_that_sample(at: Peers, here: bool) 
     (told,) = [message for message in at.heard[b"c"] if isinstance(message, Unavailable)]
     assert (told.index, told.text) == (index, "a.mp4: its sidecar .label.json: has no frame 3")
     assert not at.passed_over
-    counters = at.dispatcher.counters
+    counters = at.broker.counters
     assert (counters.unavailable, counters.refused_candidates) == (1, 0)
 
 

@@ -31,7 +31,7 @@ def test_a_lease_names_the_slot_and_its_header_goes_alone() -> None:
     (header,) = (message for message in at.heard[b"c"] if isinstance(message, SampleHeader))
     assert header.slot == 5
     assert [len(frames) for frames in at.frames[b"c"]] == [1, 1]
-    counters = at.dispatcher.counters
+    counters = at.broker.counters
     assert (counters.in_slots, counters.bytes) == (1, 2 * 2 * 8 * 8)
 
 
@@ -55,7 +55,7 @@ def test_a_worker_that_cannot_reach_it_sends_the_arrays_and_says_that_the_slot_i
     at.finish(in_slot=False)
     assert [len(frames) for frames in at.frames[b"c"]] == [1, 2]
     assert at.heard[b"c"][-1].slot == 5  # type: ignore[union-attr]
-    assert at.dispatcher.counters.in_slots == 0
+    assert at.broker.counters.in_slots == 0
 
 
 @pytest.mark.parametrize(
@@ -75,7 +75,7 @@ def test_malformed_slots_are_refused_and_no_request_is_taken(arena: str, slots: 
     at.want(0, arena=arena, slots=slots)
     assert [refused.code for refused in at.refusals()] == [ErrorCode.MALFORMED]
     assert not at.leases[b"w"]
-    assert at.dispatcher.waiting == 0
+    assert at.broker.waiting == 0
 
 
 @pytest.mark.parametrize("slot", [NO_SLOT, 6])

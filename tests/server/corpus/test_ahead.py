@@ -22,7 +22,8 @@ from v2v_protocol.errors import UsageError
 from v2v_server.commands import catalogue
 from v2v_server.commands.catalogue import main
 from v2v_server.corpus.catalogue import index_path, open_catalogue, refresh_index
-from v2v_server.corpus.index import FigureKind, Figures, IndexRow, Shard, Store
+from v2v_server.corpus.index import FigureKind, Figures, Shard, Store
+from v2v_server.corpus.videos import IndexRow
 
 _STOPS = """
 import signal, sys

@@ -24,7 +24,9 @@ from v2v_server.corpus import probe as probe_module
 from v2v_server.corpus.catalogue import Catalogue, index_path, open_catalogue
 from v2v_server.corpus.probe import probe_files
 from v2v_server.corpus.sources.folder import Folder
-from v2v_server.corpus.sources.source import MANIFEST_NAME, silent
+from v2v_server.corpus.sources.listing import silent
+from v2v_server.corpus.sources.source import MANIFEST_NAME
+from v2v_server.corpus_words import notes_of
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint, is_same_file
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.rows import Rows
@@ -275,7 +277,7 @@ def test_lists(corpus: Path, opener: Opener) -> None:
     assert ids(by_source) == ["a.mp4", "sub/b.mp4"]
     assert [(video.threshold_pos, video.threshold_neg) for video in by_source.videos] == [(None, None), (0.2, 0.3)]
     assert [refusal.video for refusal in by_source.refusals] == ["gone.mp4"]
-    assert by_source.notes == ("1 video is shorter than the list states: sub/b.mp4 has 30 frames, not 99",)
+    assert notes_of(by_source) == ["1 video is shorter than the list states: sub/b.mp4 has 30 frames, not 99"]
     # The part that the list leaves out stays in the index.
     opener(corpus)
     opener(listed)
@@ -286,7 +288,7 @@ def test_interlaced_videos_are_said_at_each_start(corpus: Path, opener: Opener) 
     write_clip(corpus / "fields.mp4", panned_luma(30, 64, 64), options={"x264-params": "interlaced=1"})
     for catalogue in (opener(corpus), opener(corpus)):
         assert len(catalogue.videos) == 4
-        (note,) = catalogue.notes
+        (note,) = notes_of(catalogue)
         assert note.startswith("1 video is interlaced (fields.mp4): the frames are served as they are stored")
     assert opener.probed == [4, 0]
 

@@ -18,8 +18,9 @@ from v2v_protocol.errors import VideoChanged, VideoError, VideoGone
 from v2v_protocol.sample import ArrayForm, Needs
 from v2v_server.corpus import probe as collecting
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.corpus.sources import source as asking
-from v2v_server.corpus.sources.source import SourceOptions, open_sidecar, open_source, read_files
+from v2v_server.corpus.sources import listing, sidecars
+from v2v_server.corpus.sources.sidecars import open_sidecar, read_files
+from v2v_server.corpus.sources.source import SourceOptions, open_source
 
 JSON, MASKS = ".boxes.json", ".masks/"
 ARRAYS = ("boxes", "masks")
@@ -95,7 +96,7 @@ def test_a_catalogue_knows_them_and_its_digest_does_not(
 
 def test_an_interrupted_start_keeps_what_it_has_read(corpus: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (corpus / "deep/b.x.boxes.json").write_text("[2]")
-    monkeypatch.setattr(asking, "_TOGETHER", 1)
+    monkeypatch.setattr(listing, "_TOGETHER", 1)
     read: list[str] = []
 
     def interrupted(opened: Path) -> tuple[str, bytes]:
@@ -151,7 +152,8 @@ def test_it_is_opened_like_the_video_and_a_changed_and_a_missing_one_are_told_ap
         catalogue.check("a.mp4", boxes, JSON)
         catalogue.check("deep/b.x.mp4", masks, MASKS)
         source = open_source(name_of(corpus, kind), SourceOptions(cache_dir=corpus.parent / "other"))
-        source.make()
+        if source.copies is not None:
+            source.copies.make()
         files = {"a.boxes.json": boxes, "deep/b.x.masks/": masks}
         assert source.has(files) is source.is_local
         source.fetch(files)
@@ -161,7 +163,8 @@ def test_it_is_opened_like_the_video_and_a_changed_and_a_missing_one_are_told_ap
         with open_sidecar(source, "deep/b.x.masks/", masks, table) as folder:
             assert (folder / "2.png").read_bytes() == b"2.png"
             assert (folder / "more" / "3.png").read_bytes() == b"more/3.png"
-        source.release()
+        if source.copies is not None:
+            source.copies.release()
         (corpus / "a.boxes.json").write_text("[2]")
         (corpus / "deep/b.x.masks/3.png").write_text("new")
         for id, ending, mark in (("a.mp4", JSON, boxes), ("deep/b.x.mp4", MASKS, masks)):
@@ -175,7 +178,8 @@ def test_it_is_opened_like_the_video_and_a_changed_and_a_missing_one_are_told_ap
         for video in catalogue.videos:
             catalogue.check(video.id, video.fingerprint)
     fresh = open_source(name_of(corpus, kind), SourceOptions(cache_dir=corpus.parent / "fresh"))
-    fresh.make()
+    if fresh.copies is not None:
+        fresh.copies.make()
     with pytest.raises(VideoGone), open_sidecar(fresh, "a.boxes.json", boxes):
         pass
     with pytest.raises(VideoError), open_sidecar(fresh, "deep/b.x.masks/", masks, table):
@@ -253,7 +257,7 @@ def test_a_lease_names_only_the_files_of_its_frames(corpus: Path, kind: str) -> 
 def test_files_too_large_for_one_clip_are_an_error_of_the_sidecar(
     corpus: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(asking, "MOST_LENT_BYTES", 6)
+    monkeypatch.setattr(sidecars, "MOST_LENT_BYTES", 6)
     fingerprint, table = read_files(corpus / "deep/b.x.masks")
     source = open_source(str(corpus), SourceOptions())
     with (

@@ -23,6 +23,7 @@ from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue, index_path, open_catalogue
 from v2v_server.corpus.sources.source import MANIFEST_NAME
+from v2v_server.corpus_words import notes_of
 from v2v_server.schedule import SequenceTable
 from v2v_server.video.fingerprint import check_fingerprint, fingerprint
 from v2v_server.video.rows import Rows
@@ -197,7 +198,7 @@ def test_same_ids_sequences_and_digest(catalogues: tuple[Catalogue, Catalogue]) 
     assert len(prepared.frame_index(CORRUPT)) == video.frames == 50
     with pytest.raises(VideoError):
         check_fingerprint(prepared.path(CORRUPT), video.fingerprint)
-    assert any(CORRUPT in note for note in prepared.notes)
+    assert any(CORRUPT in note for note in notes_of(prepared))
 
 
 def test_lists_of_the_source_hold(small: tuple[Path, Path], tmp_path: Path) -> None:
@@ -222,7 +223,7 @@ def test_a_missing_or_changed_file_keeps_its_place(copied: Path) -> None:
     (copied / "b.webm").write_bytes((copied / "e.mov").read_bytes())
     spoilt = opened(copied)
     assert sequences(spoilt) == sequences(whole)
-    assert "a.mp4: its file is missing or changed" in str(spoilt.notes)
+    assert "a.mp4: its file is missing or changed" in str(notes_of(spoilt))
     for video in spoilt.videos[:2]:
         with pytest.raises(VideoError):
             check_fingerprint(copied / video.id, video.fingerprint)

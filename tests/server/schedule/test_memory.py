@@ -21,7 +21,7 @@ from contextlib import closing
 from v2v_protocol.sample import DEFAULT_ARRAYS, array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.schedule import lease_bytes
+from v2v_server.lease_memory import lease_bytes
 from v2v_server.worker.warm_up import warm_up_in_turn
 from v2v_tools.remake import Remaker
 
@@ -32,7 +32,7 @@ if __name__ == "__main__":
         remaker = Remaker(catalogue, spec)
         gc.collect()
         open("/proc/self/clear_refs", "w").write("5")
-        video = remaker.made(0, 0, 0) and remaker.sequence(0, 0, 0).video
+        video = remaker.made(0, 0, 0) and catalogue.videos[0]
         status = dict(line.split(":", 1) for line in open("/proc/self/status"))
         arrays = layout_bytes(array_layout(spec.recipe, spec.voxel_dtype, DEFAULT_ARRAYS))
         print(lease_bytes(video, catalogue.rows, spec, arrays), 1024 * int(status["VmHWM"].split()[0]))

@@ -14,9 +14,10 @@ from tests.pieces import pieces, shots
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import DEFECTS, StreamSpec
+from v2v_server.corpus.scenes.runs import Cleaning, Runs
 from v2v_server.corpus.scenes.scene import NO_BARS, Flag, Pieces, Sides
 from v2v_server.corpus.videos import SplitVideos, VideoEntry, encoded_pieces
-from v2v_server.schedule import Cleaning, Runs, SequenceTable
+from v2v_server.schedule import SequenceTable
 from v2v_server.video.rows import Rows
 
 RECIPE = Recipe(voxels_per_clip=4, bins=5, crop_height_px=32, crop_width_px=32)

@@ -23,9 +23,9 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server import schedule as sequences
 from v2v_server.corpus.scenes.scene import Flag
 from v2v_server.corpus.videos import VideoEntry, encoded_pieces
-from v2v_server.schedule import MOST_CANDIDATES, MOST_CLIP_BYTES, MOST_LEASE_BYTES, Schedule, SequenceTable
+from v2v_server.lease_memory import LARGEST_MEMORY_BYTES, MOST_CLIP_BYTES, MOST_LEASE_BYTES
+from v2v_server.schedule import MOST_CANDIDATES, Schedule, SequenceTable
 from v2v_server.video.rows import Rows
-from v2v_server.worker.process import LARGEST_MEMORY_BYTES
 
 FULL = Rows()
 

@@ -14,7 +14,8 @@ from v2v_protocol.sample import Refusal
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.videos import VideoEntry
-from v2v_server.schedule import SequenceTable, corpus_summary, sequence_span
+from v2v_server.corpus_words import corpus_summary, sequence_span
+from v2v_server.schedule import SequenceTable
 from v2v_server.video.rows import Rows
 
 

@@ -97,7 +97,7 @@ def test_effects_see_the_light_of_deep_levels() -> None:
 def test_signals_that_are_refused() -> None:
     deep = np.full((6, 4, 4), 1024, np.uint16)
     for given_signal, words in (
-        ({"bits": 13}, "bits = 13"),
+        ({"bits": 17}, "bits = 17"),
         ({"transfer": "srgb"}, "transfer 'srgb'"),
         ({"bits": 10}, "levels up to 1024"),
         ({}, "uint16"),

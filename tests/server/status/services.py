@@ -79,7 +79,7 @@ def published(at: Peers, **settings: Any) -> Published:
     config = ServeConfig.load(None, {"videos": "videos"} | settings)
     transport, pool = Queues(), ToyPool(lambda name, address: None)
     catalogue = corpus(*(video(f"v{number}.mp4") for number in range(5)))
-    publisher = StatusPublisher(config, catalogue, at.dispatcher, pool, transport, at.now, lambda: WALL)
+    publisher = StatusPublisher(config, catalogue, at.broker, pool, transport, at.now, lambda: WALL)
     publisher._processor_clock = lambda: 0.0  # a slow host builds a status less often
     publisher.tick(at.now)
     return Published(at, publisher, transport, pool)

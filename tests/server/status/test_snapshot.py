@@ -74,11 +74,11 @@ def test_a_row_says_what_a_worker_makes_and_what_it_took(at: Peers, service: Pub
 def test_a_worker_rests_is_idle_or_lost(at: Peers, service: Published) -> None:
     for name in (b"idle", b"resting", b"lost"):
         at.join(name)
-    at.dispatcher.registry.rest(b"resting", at.now, "v0.mp4: no such file")
+    at.broker.registry.rest(b"resting", at.now, "v0.mp4: no such file")
     at.now = 31.0
     for name in (b"idle", b"resting"):
-        at.dispatcher.registry.mark_heard(name, at.now)
-    at.dispatcher.registry.vanished(at.now)
+        at.broker.registry.mark_heard(name, at.now)
+    at.broker.registry.vanished(at.now)
     states = {worker.name: worker for worker in service.view().workers}
     assert {name: worker.state for name, worker in states.items()} == {
         "idle": "idle", "resting": "resting", "lost": "lost",
@@ -125,7 +125,7 @@ def test_a_row_says_where_a_consumer_is_in_its_epoch(at: Peers, service: Publish
     assert consumer.waiting_share == pytest.approx(0.2)
     assert (consumer.state, consumer.waited_seconds, consumer.seed) == ("taking", 2.0, 7)
     assert consumer.eta_seconds == pytest.approx((50 - 21) / 1.1, rel=0.01)  # it began at 10
-    assert service.view().specs[consumer.spec] == at.dispatcher.sessions.get(b"c").spec.to_dict()  # type: ignore[union-attr]
+    assert service.view().specs[consumer.spec] == at.broker.sessions.get(b"c").spec.to_dict()  # type: ignore[union-attr]
 
 
 def test_a_new_epoch_begins_at_its_beginning(at: Peers, service: Published) -> None:
@@ -213,10 +213,10 @@ def test_rows_add_up_to_the_totals(epochs: list[tuple[bytes, int, float, bool]])
         if leaves:
             at.consumer_says(identity, Goodbye(0.1 * batches))
         service.pass_seconds(pause)
-        totals = list(at.dispatcher.sessions.totals())
+        totals = list(at.broker.sessions.totals())
         assert len({each.number for each in totals}) == len(totals)
-        assert sum(each.served for each in totals) == at.dispatcher.counters.samples
-        assert sum(each.waited_seconds for each in totals) == pytest.approx(at.dispatcher.counters.waited_seconds)
+        assert sum(each.served for each in totals) == at.broker.counters.samples
+        assert sum(each.waited_seconds for each in totals) == pytest.approx(at.broker.counters.waited_seconds)
         for row in service.view().consumers:
             assert 0.0 <= row.waiting_share <= 1.0
             assert 0.0 <= row.epoch_share <= 1.0
@@ -274,7 +274,7 @@ def test_refusals_and_verdicts_are_listed_newest_first(at: Peers, service: Publi
 
 def test_of_many_refusals_and_verdicts_with_long_texts_the_last_few_are_listed(at: Peers) -> None:
     for number in range(100):
-        at.dispatcher.refusals.append(RefusalPart.of(Refusal("\x01" * 4000, None, "x" * 4000), str(number)))
+        at.broker.refusals.append(RefusalPart.of(Refusal("\x01" * 4000, None, "x" * 4000), str(number)))
     at.quarantine.extend(
         [QuarantineEntry(number + 1, "\x03" * 4000, "f", 0, "\x04" * 4000, WALL) for number in range(100)]
     )
@@ -434,7 +434,7 @@ def test_the_shares_are_of_the_time_that_was_noted(at: Peers, service: Published
         result = Result(lease.lease, 0, decode_seconds=0.25, simulate_seconds=0.5, handover_seconds=0.125)
         at.worker_says(b"busy", result, *answer_to(lease))
         at.dispatcher.worker_stalled(b"busy", Stall(queued_seconds=0.5))
-        waited = at.dispatcher.sessions.get(b"waits").waited_seconds + 0.5  # type: ignore[union-attr]
+        waited = at.broker.sessions.get(b"waits").waited_seconds + 0.5  # type: ignore[union-attr]
         at.consumer_says(b"waits", Want(0, (lease.indices[0] + 1,), waited_seconds=waited))
     shares = service.view().waiting.shares
     assert shares.seconds == pytest.approx(10.0)

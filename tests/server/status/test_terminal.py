@@ -120,8 +120,8 @@ def test_workers_that_start_and_those_of_other_hosts_are_counted(at: Peers) -> N
 
 
 def test_shared_decodes_shared_memory_and_the_cache_are_named_where_there_are_any(at: Peers) -> None:
-    at.dispatcher.counters.samples, at.dispatcher.counters.decodes = 30, 12
-    at.dispatcher.counters.in_slots, at.dispatcher.counters.cache_hits, at.dispatcher.counters.cache_misses = 15, 9, 3
+    at.broker.counters.samples, at.broker.counters.decodes = 30, 12
+    at.broker.counters.in_slots, at.broker.counters.cache_hits, at.broker.counters.cache_misses = 15, 9, 3
     status = published(at).plain()
     assert "2.5 samples per decode  50% by shared memory  cache 75% hits  workers" in said(status)
     cache = {"folder": "/cache", "held_gib": 1.5, "most_gib": 4.0, "hits": 9, "misses": 3, "trouble": "no room"}
@@ -129,7 +129,7 @@ def test_shared_decodes_shared_memory_and_the_cache_are_named_where_there_are_an
 
 
 def test_unusual_events_are_named_once_there_are_any(at: Peers) -> None:
-    at.dispatcher.counters.malformed, at.dispatcher.counters.returned_leases = 2, 3
+    at.broker.counters.malformed, at.broker.counters.returned_leases = 2, 3
     assert said(published(at).status()).endswith("faults 2  total 0 samples  3 returned leases  2 malformed")
 
 
@@ -173,7 +173,7 @@ def test_faults_are_the_counters_that_say_so() -> None:
 
 
 def test_samples_faults_and_rates_are_summed_up(at: Peers) -> None:
-    counters = at.dispatcher.counters
+    counters = at.broker.counters
     counters.samples, counters.batches, counters.decodes, counters.bytes = 600, 50.0, 200, 3 << 30
     counters.refused_candidates, counters.workers_lost, counters.returned_leases = 2, 1, 4
     counters.waited_seconds = 90.0

@@ -16,7 +16,7 @@ DECLARED = ("broker/state.py", "    cache_hits: int = 0\n", '    pings: int = co
 COUNTED = (
     "broker/dispatcher.py",
     "        match message:\n            case Hello():\n",
-    "        self.counters.pings += isinstance(message, Ping)\n",
+    "        broker.counters.pings += isinstance(message, Ping)\n",
 )
 VIEWS = """
 import io, json, re

@@ -29,8 +29,9 @@ from v2v_server.corpus.sources.folder import Folder
 from v2v_server.store.cache import Cache, make_cache, piece_frames
 from v2v_server.store.quota import PARTIAL, QuotaFolder, count_bytes, used_bytes
 from v2v_server.system.process import locked
-from v2v_server.worker.process import Clips
-from v2v_server.worker.produce import make_sample
+from v2v_server.worker.job import SampleJob
+from v2v_server.worker.making.make import make_sample
+from v2v_server.worker.making.read import Clips
 
 SPEC = StreamSpec(recipe=Recipe(voxels_per_clip=4, bins=5, crop_height_px=24, crop_width_px=32))
 """Needs 21 frames."""
@@ -64,8 +65,9 @@ def leases_of(source: Path, count: int, spec: StreamSpec = SPEC) -> Iterator[tup
 
 
 def made(lease: Lease, clips: Clips) -> tuple[Sample, str]:
-    decoded, _ = clips.take(lease)
-    return make_sample(lease, decoded), clips.said_of_cache(decoded)
+    job = SampleJob.of(lease)
+    decoded, _ = clips.take(job.clip, lease.indices)
+    return make_sample(job, decoded), clips.said_of_cache(decoded)
 
 
 def epoch(source: Path, cache: Cache, count: int = 8, spec: StreamSpec = SPEC) -> list[str]:
@@ -210,11 +212,13 @@ def test_what_a_killed_worker_leaves_is_not_used_and_removed(source: Path, folde
     program = (
         "import os, signal, sys\nfrom pathlib import Path\nimport v2v_server.store.cache as cache\n"
         "from v2v_protocol.messages import decode\nfrom v2v_server.corpus.sources.folder import Folder\n"
-        "from v2v_server.store.store_file import StoreWriter\nfrom v2v_server.worker.process import Clips\n"
+        "from v2v_server.store.store_file import StoreWriter\nfrom v2v_server.worker.job import ClipJob\n"
+        "from v2v_server.worker.making.read import Clips\n"
         "cache.piece_frames = lambda rows, width: 16\n"
         "StoreWriter.close = lambda self, **more: os.kill(os.getpid(), signal.SIGKILL)\n"
         "clips = Clips(Folder(Path(sys.argv[1])), cache.Cache(Path(sys.argv[2]), 1 << 30, 0))\n"
-        "clips.take(decode(bytes.fromhex(sys.argv[3])))\n"
+        "lease = decode(bytes.fromhex(sys.argv[3]))\n"
+        "clips.take(ClipJob.of(lease), lease.indices)\n"
     )
     ((root, lease),) = leases_of(source, 1)
     done = subprocess.run([sys.executable, "-c", program, root, folder, bytes(encode(lease)[0]).hex()], check=False)

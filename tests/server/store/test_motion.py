@@ -18,7 +18,9 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server import motion
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.store.cache import Cache, make_cache
-from v2v_server.worker.produce import decode_for, make_sample
+from v2v_server.worker.job import SampleJob
+from v2v_server.worker.making.make import make_sample
+from v2v_server.worker.making.read import decode_for
 
 ROWS, PLANES = "top:0.9", ("motion",)
 RECIPE = Recipe(
@@ -50,11 +52,10 @@ def samples(videos: Path, spec: StreamSpec, cache: Cache | None = None, count: i
     found = []
     with open_leases(videos, ROWS, spec) as (root, leases):
         for lease in islice(leases, count):
-            lease = replace(lease, arrays=("voxels", "event_counts"))
-            for index, decoded in zip(
-                lease.indices, decode_for(lease, lease.indices, Folder(root), cache), strict=True
-            ):
-                found.append(make_sample(replace(lease, indices=(index,)), decoded))
+            job = SampleJob.of(replace(lease, arrays=("voxels", "event_counts")))
+            all_decoded = decode_for(job.clip, lease.indices, Folder(root), cache)
+            for index, decoded in zip(lease.indices, all_decoded, strict=True):
+                found.append(make_sample(replace(job, index=index), decoded))
     return found
 
 
@@ -94,9 +95,9 @@ def test_where_nothing_moves_no_margin_is_read_for_sub_steps(tmp_path: Path, flo
     made = []
     for folder in ("source", "planes"):
         with open_leases(tmp_path / folder, ROWS, spec) as (root, leases):
-            lease = replace(next(leases), arrays=("voxels", "flow") if flow else ("voxels",))
-            (decoded,) = decode_for(lease, lease.indices, Folder(root))
-            made.append((decoded.clip.frames.shape[1:], make_sample(lease, decoded)))
+            job = SampleJob.of(replace(next(leases), arrays=("voxels", "flow") if flow else ("voxels",)))
+            (decoded,) = decode_for(job.clip, [job.index], Folder(root))
+            made.append((decoded.clip.frames.shape[1:], make_sample(job, decoded)))
     ((around, expected), (read, found)) = made
     require_equal([found], [expected])
     assert read[0] - 26 <= (8 if flow else 0) < around[0] - 26

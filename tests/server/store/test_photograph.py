@@ -23,16 +23,18 @@ from v2v_protocol.messages import Denied, Hello, Welcome
 from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
+from v2v_server.kinds.kind import VideosKind
+from v2v_server.kinds.photographs import LONGEST_PHOTOGRAPH_FRAMES, PhotographKind
+from v2v_server.kinds.registry import kind_from, kind_of
 from v2v_server.prepare import prepare
 from v2v_server.schedule import SequenceTable
 from v2v_server.store import photograph
 from v2v_server.store.cache import Cache, make_cache
-from v2v_server.store.photograph import Photograph, id_of
+from v2v_server.store.photograph import Photograph
 from v2v_server.store.picture_sequence import decode_picture
-from v2v_server.store.pixels import LONGEST_PHOTOGRAPH_FRAMES, VideosKind, kind_of
 from v2v_server.video.decode import ClipRequest, Cut
 
-PHOTOGRAPHS = VideosKind("photographs", 60.0, 0.5)
+PHOTOGRAPHS = PhotographKind(60.0, 0.5)
 ALL = ("voxels", "frames", "flow", "flow_valid", "masks", "tracks")
 SIZE = {"crop_height_px": 48, "crop_width_px": 64, "pause_probability": 0.0, "world_still_share": 0.0}
 FAST = SIZE | {"world_speed_px": (100.0, 300.0), "world_patch_px": (30.0, 40.0), "track_points": 32}
@@ -90,9 +92,9 @@ def test_a_photograph_is_a_video_of_stated_rate_and_length(folder: Path, catalog
     assert list(catalogue.videos.ids) == ["a.png", "b.jpg", "c.webp", "d.tiff"]
     assert {(each.frames, each.frames_per_second) for each in catalogue.videos} == {(31, 60.0)}
     assert catalogue.frame_index("a.png").seconds(0, 31) == pytest.approx(np.arange(31) / 60, abs=1e-9)
-    assert catalogue.kind == "photographs"
+    assert catalogue.kind.name == "photographs"
     digests = {catalogue.digest}
-    for kind in (VideosKind("photographs"), VideosKind("photographs", 30.0, 0.5), VideosKind("photographs", 60.0, 1.0)):
+    for kind in (PhotographKind(), PhotographKind(30.0, 0.5), PhotographKind(60.0, 1.0)):
         with opened(folder, kind) as other:  # the index is the same file
             assert {each.frames for each in other.videos} == {kind.frames}
             digests.add(other.digest)
@@ -104,24 +106,28 @@ def test_a_photograph_is_a_video_of_stated_rate_and_length(folder: Path, catalog
 @given(st.floats(0.01, 1e4), st.floats(1e-4, 1e6))
 def test_lengths_and_rates_are_checked(seconds: float, rate: float) -> None:
     if 1 <= math.floor(seconds * rate + 0.5) < LONGEST_PHOTOGRAPH_FRAMES:
-        assert abs(VideosKind("photographs", rate, seconds).frames - 1 - seconds * rate) <= 0.5
+        assert abs(PhotographKind(rate, seconds).frames - 1 - seconds * rate) <= 0.5
     else:
         with pytest.raises(UsageError, match=f"give 2 to {LONGEST_PHOTOGRAPH_FRAMES}"):
-            VideosKind("photographs", rate, seconds)
+            PhotographKind(rate, seconds)
 
 
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (("videos", 0.0, 10.0), "photographs a rate and a duration"),
-        (("sequences", 0.0, 10.0), "photographs a rate and a duration"),
-        (("videos", 25.0), r"--videos-kind videos, --rate 25: .*sequences can have a rate"),
-        (("films",), "--videos-kind films, --rate 0: choose one of videos, sequences"),
+        (
+            ("videos", 0.0, 10.0),
+            "--photograph-seconds 10.0 has no effect without --videos-kind photographs .now videos.",
+        ),
+        (("sequences", 0.0, 10.0), "--photograph-seconds 10.0 has no effect without --videos-kind photographs"),
+        (("videos", 25.0), "--rate 25.0 has no effect without --videos-kind sequences or photographs"),
+        (("videos", "fast"), "--rate = 'fast': give a number from 0 to 1e.06 Hz"),
+        (("films",), "--videos-kind = 'films': choose one of videos, sequences"),
     ],
 )
 def test_only_photographs_have_a_length_and_videos_no_rate(settings: tuple[Any, ...], words: str) -> None:
     with pytest.raises(UsageError, match=words):
-        VideosKind(*settings)
+        kind_from(dict(zip(("videos_kind", "rate", "photograph_seconds"), settings, strict=False)))
 
 
 @pytest.mark.parametrize("turned", range(1, 9))
@@ -198,10 +204,10 @@ def test_bad_photographs_are_refused_alone(tmp_path: Path, picture: Grey) -> Non
 
 
 def test_what_is_no_photograph_is_left_out(tmp_path: Path, picture: Grey) -> None:
-    assert [id_of(name) for name in ("a.JPG", "b/c.tif", "d.mp4", "jpg", "e.masks/0.png")] == [
+    assert [PHOTOGRAPHS.id_of(name) for name in ("a.JPG", "b/c.tif", "d.mp4", "jpg", "e.masks/0.png")] == [
         "a.JPG", "b/c.tif", "", "", "e.masks/0.png",
     ]  # fmt: skip
-    assert [kind_of(id) for id in ("a.JPG", "b/", "c.zip", "d.mp4")] == [
+    assert [kind_of(id).name for id in ("a.JPG", "b/", "c.zip", "d.mp4")] == [
         "photographs", "sequences", "sequences", "videos",
     ]  # fmt: skip
     with pytest.raises(CorpusError, match=r"no video found; looked for \.bmp \.jpeg"), opened(tmp_path):
@@ -307,7 +313,7 @@ def test_a_large_photograph_takes_the_memory_of_its_crops() -> None:
 
 
 def test_a_picture_is_no_video(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(CorpusError, match="is a picture: add --videos-kind photographs"):
+    with pytest.raises(CorpusError, match="is a picture that the camera moves over: add --videos-kind photographs"):
         open_catalogue(folder / "b.jpg", cache_dir=tmp_path, processes=0)
     with closing(open_catalogue(folder / "b.jpg", cache_dir=tmp_path, kind=PHOTOGRAPHS, processes=0)) as one:
         assert list(one.videos.ids) == ["b.jpg"]

@@ -28,15 +28,20 @@ from tests.digests.rows import Row, samples_of
 from v2v_protocol.errors import CorpusError, UsageError, VideoChanged, VideoError
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.sources.source import SourceOptions, open_source
+from v2v_server.corpus_words import notes_of
+from v2v_server.kinds.kind import VideosKind
+from v2v_server.kinds.registry import kind_from
+from v2v_server.kinds.sequences import SequenceKind
+from v2v_server.kinds.videos import VideoKind
 from v2v_server.prepare import prepare
 from v2v_server.store import picture_sequence
 from v2v_server.store.cache import Cache, make_cache
-from v2v_server.store.picture_sequence import PictureSequence, id_of
-from v2v_server.store.pixels import VideosKind, signal_of
+from v2v_server.store.picture_sequence import PictureSequence
+from v2v_server.store.pixels import signal_of
 from v2v_server.video.decode import ClipRequest, Cut
 from v2v_server.video.fingerprint import fingerprint
 
-SEQUENCES, AT_25 = VideosKind("sequences"), VideosKind("sequences", 25.0)
+SEQUENCES, AT_25 = SequenceKind(), SequenceKind(25.0)
 FRAMES, HEIGHT, WIDTH = 30, 32, 40
 ROW = Row("paper", ("voxels", "frames", "frames_rgb"))
 DEEP = Row({"light": "declared"}, ("voxels", "frames", "frames_u16", "frames_rgb"))
@@ -115,14 +120,14 @@ def test_exported_frames_give_the_samples_of_their_clip(tmp_path: Path, clip: st
     write_lossless(tmp_path / "clips/a.mkv", clip)
     export(tmp_path / "clips/a.mkv", tmp_path / "seqs/a", picture, codec)
     row = DEEP if "16" in clip else ROW
-    with opened(tmp_path / "clips", VideosKind()) as clips, opened(tmp_path / "seqs", AT_25) as sequences:
+    with opened(tmp_path / "clips", VideoKind()) as clips, opened(tmp_path / "seqs", AT_25) as sequences:
         assert [video.id for video in sequences.videos] == ["a/"]
         assert sequences.videos[0].codec == codec
         assert arrays(sequences, row) == arrays(clips, row)
 
 
 def test_archive_cache_and_store_give_the_same_samples(grey: Path, tmp_path: Path) -> None:
-    with opened(grey / "clips", VideosKind()) as clips:
+    with opened(grey / "clips", VideoKind()) as clips:
         expected = arrays(clips)
     (tmp_path / "zips").mkdir()
     with zipfile.ZipFile(tmp_path / "zips/a.zip", "w", zipfile.ZIP_DEFLATED) as packed:
@@ -142,7 +147,7 @@ def test_archive_cache_and_store_give_the_same_samples(grey: Path, tmp_path: Pat
         again = prepare(sequences, tmp_path / "store", processes=0, scene=True, planes=("chroma", "motion"))
         assert again.kept == 1
         digest = sequences.digest
-    for kind in (VideosKind(), SEQUENCES):  # a store needs no flag
+    for kind in (VideoKind(), SEQUENCES):  # a store needs no flag
         with opened(tmp_path / "store", kind, scene=True) as store:
             assert store.digest == digest
             assert arrays(store) == expected
@@ -178,14 +183,14 @@ def test_labels_lie_beside_the_folder(tmp_path: Path) -> None:
 
 
 def test_without_the_flag_pictures_are_no_videos(grey: Path, tmp_path: Path) -> None:
-    message = refusal(grey / "seqs", VideosKind())
+    message = refusal(grey / "seqs", VideoKind())
     assert "no video found" in message
     assert "--videos-kind sequences" in message
     shutil.copytree(grey / "clips", tmp_path / "both")
-    with opened(grey / "clips", VideosKind()) as clips:
+    with opened(grey / "clips", VideoKind()) as clips:
         alone = clips.digest
     shutil.copytree(grey / "seqs/a", tmp_path / "both/pictures")
-    with opened(tmp_path / "both", VideosKind()) as both:
+    with opened(tmp_path / "both", VideoKind()) as both:
         assert (both.digest, both.refusals, both.notes) == (alone, (), ())
 
 
@@ -242,17 +247,22 @@ def test_what_is_assumed_of_times_is_said(tmp_path: Path) -> None:
     (tmp_path / "seqs/s/timestamps.txt").write_text("4132468\n4168182\n4203896\n4239610\n")
     with opened(tmp_path / "seqs") as catalogue:
         assert catalogue.videos.frames_per_second.tolist() == pytest.approx([28], abs=0.01)
-        assert catalogue.videos[0].remark == "its times are taken for us, 28 pictures a second"
-        assert any("s/: its times are taken for us" in note for note in catalogue.notes)
+        assert catalogue.videos[0].remark == "timestamps.txt: its times are taken for us, 28 pictures a second"
+        assert any("s/: timestamps.txt: its times are taken for us" in note for note in notes_of(catalogue))
+    (tmp_path / "seqs/s/timestamps.txt").write_text("1\n2\n3\n4\n")
+    with opened(tmp_path / "seqs") as catalogue:
+        (note,) = notes_of(catalogue)
+        assert "s/: timestamps.txt: its numbers, 1, 2 ..., count the pictures one by one" in note
+        assert "remove the file and state the rate with --rate" in note
     write_times(tmp_path / "seqs/s/timestamps.txt", ["0", "10", "20", "30"])
     with opened(tmp_path / "seqs") as catalogue:
         assert catalogue.videos.frames_per_second.tolist() == [0.1]
-        (note,) = catalogue.notes
+        (note,) = notes_of(catalogue)
         assert "1 video has a rate outside of 0.5 to 20000 frames a second (s/: 0.1)" in note
     (tmp_path / "seqs/s/timestamps.txt").unlink()
     for rate, is_odd in ((0.4, True), (0.5, False), (20000.0, False), (20001.0, True), (0.0, False)):
-        with opened(tmp_path / "seqs", VideosKind("sequences", rate)) as catalogue:
-            assert any("outside of" in note for note in catalogue.notes) == is_odd, rate
+        with opened(tmp_path / "seqs", SequenceKind(rate)) as catalogue:
+            assert any("outside of" in note for note in notes_of(catalogue)) == is_odd, rate
 
 
 def test_rates_come_from_the_flag_or_a_list(tmp_path: Path) -> None:
@@ -381,7 +391,7 @@ def test_fewer_bits_than_the_picture_has_are_asked_about_and_stretched_if_stated
     assert abs(plain.max() - 255 * ((1 << bits) - 1) / 65535) <= 1, "never stretched unasked"
     if bits == 16:
         return
-    with opened(tmp_path / "seqs", VideosKind("sequences", 25.0, picture_bits=bits)) as catalogue:
+    with opened(tmp_path / "seqs", SequenceKind(25.0, picture_bits=bits)) as catalogue:
         assert catalogue.digest != digest
         assert np.abs(grey(catalogue) - whole).max() <= 1
         assert grey(catalogue).max() == 255
@@ -391,7 +401,7 @@ def test_fewer_bits_than_the_picture_has_are_asked_about_and_stretched_if_stated
     with opened(tmp_path / "seqs", AT_25) as catalogue:
         assert catalogue.digest == digest
     if bits > 8:
-        message = refusal(tmp_path / "seqs", VideosKind("sequences", 25.0, picture_bits=bits - 1))
+        message = refusal(tmp_path / "seqs", SequenceKind(25.0, picture_bits=bits - 1))
         assert f"has a level of {(1 << bits) - 1}, beyond those of --picture-bits {bits - 1}" in message
 
 
@@ -403,7 +413,7 @@ def test_a_level_beyond_the_stated_bits_is_never_cut(tmp_path: Path) -> None:
     pictures = deep(40, 12, 1)
     pictures[1][3, 5] = 4096
     write_deep(tmp_path / "seqs/s", pictures, "png gray16be")
-    with opened(tmp_path / "seqs", VideosKind("sequences", 25.0, picture_bits=12)) as catalogue:
+    with opened(tmp_path / "seqs", SequenceKind(25.0, picture_bits=12)) as catalogue:
         index, pixels = catalogue.frame_index("s/"), PictureSequence(tmp_path / "seqs/s")
     assert len(pixels.clips(ClipRequest(index, 2, (Cut(3),)))[0].frames) == 3
     with pytest.raises(
@@ -416,15 +426,16 @@ def test_bits_of_pictures_of_8_are_said_not_to_apply(tmp_path: Path) -> None:
     write_pictures(tmp_path / "seqs/s", panned_luma(3, HEIGHT, WIDTH))
     with opened(tmp_path / "seqs", AT_25) as catalogue:
         fingerprint = catalogue.videos[0].fingerprint
-    with opened(tmp_path / "seqs", VideosKind("sequences", 25.0, picture_bits=12)) as catalogue:
+    with opened(tmp_path / "seqs", SequenceKind(25.0, picture_bits=12)) as catalogue:
         assert catalogue.videos[0].fingerprint == fingerprint
         assert "--picture-bits 12 does not apply" in catalogue.videos[0].remark
 
 
 @pytest.mark.parametrize(("kind", "bits"), [("videos", 12), ("photographs", 12), ("sequences", 7), ("sequences", 16)])
 def test_bits_that_no_picture_has_are_refused(kind: str, bits: int) -> None:
-    with pytest.raises(UsageError, match=f"--picture-bits {bits}: .*8 to 15 picture bits"):
-        VideosKind(kind, picture_bits=bits)
+    wanted = "has no effect without --videos-kind sequences" if bits == 12 else "whole number from 8 to 15"
+    with pytest.raises(UsageError, match=f"--picture-bits [= ]*{bits}:? .*{wanted}"):
+        kind_from({"videos_kind": kind, "picture_bits": bits})
 
 
 @pytest.fixture
@@ -645,8 +656,8 @@ def test_damaged_archives_and_pictures_fail_cleanly(
 def test_pictures_belong_to_their_folder(folders: list[str], stem: str, number: int, suffix: str) -> None:
     path = "/".join([*folders, f"{stem}{number}{suffix}"])
     is_picture = suffix not in (".mp4", ".txt", "")
-    assert id_of(path) == ("/".join(folders) + "/" if is_picture else "")
-    assert id_of(f"a.masks/{path}") == id_of(f"b/a.masks/{path}") == ""
+    assert SEQUENCES.id_of(path) == ("/".join(folders) + "/" if is_picture else "")
+    assert SEQUENCES.id_of(f"a.masks/{path}") == SEQUENCES.id_of(f"b/a.masks/{path}") == ""
 
 
 @pytest.fixture
@@ -665,7 +676,7 @@ def bucket(grey: Path, tmp_path: Path) -> Iterator[str]:
 @pytest.mark.filterwarnings("ignore")
 def test_sequences_of_a_bucket_are_as_on_a_disk(bucket: str, grey: Path, tmp_path: Path) -> None:
     options: dict[str, Any] = {"cache_dir": tmp_path, "copies": tmp_path / "copies", "kind": SEQUENCES, "processes": 0}
-    with opened(grey / "clips", VideosKind()) as clips, closing(open_catalogue(bucket, **options)) as catalogue:
+    with opened(grey / "clips", VideoKind()) as clips, closing(open_catalogue(bucket, **options)) as catalogue:
         assert list(catalogue.videos.ids) == ["s/imgs/"]
         assert catalogue.videos.frames_per_second.tolist() == pytest.approx([25])
         assert arrays(catalogue) == arrays(clips)

@@ -132,7 +132,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from v2v_server.store.planes import Plane
+from v2v_server.store.planes.plane import Plane
 
 
 class Peaks(Plane):
@@ -167,7 +167,7 @@ PLANE = Peaks(version=1, dtype="|u1", values=1, cell_px=8, serves="peaks")
 '''
 
 LINES = (
-    ("v2v_server/store/pixels.py", '"store_file", "video_file"', '"toy_raw", "toy_world", '),
+    ("v2v_server/kinds/videos.py", '"store_file", "video_file"', '"toy_raw", "toy_world", '),
     ("v2v_server/store/planes/__init__.py", '"motion", "detail"', '"peaks", '),
 )
 
@@ -246,7 +246,8 @@ with opened("world") as catalogue:
 @pytest.fixture
 def tree(tmp_path: Path) -> Path:
     """The files with the additions, which an import prefers to those of the packages; a clip in both formats."""
-    (tmp_path / "v2v_server/store/planes").mkdir(parents=True)
+    for name in ("store/planes", "kinds"):
+        (tmp_path / "v2v_server" / name).mkdir(parents=True)
     for name, *_ in LINES:
         shutil.copy(ROOT / name, tmp_path / name)
     add(tmp_path, LINES)

@@ -28,7 +28,8 @@ from v2v_server.store.format import (
     pack_record,
     unpack,
 )
-from v2v_server.store.planes import PLANES, Plane, read_footer
+from v2v_server.store.planes import PLANES
+from v2v_server.store.planes.plane import Plane, read_footer
 from v2v_server.store.store_file import StoreFile, StoreWriter, is_store_file
 
 PACKINGS = st.sampled_from([DENSE, FAST, QUICK, RAW])

@@ -26,20 +26,23 @@ from v2v_server.commands.prepare import main as run_prepare
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.corpus.sources.source import open_source
+from v2v_server.kinds.photographs import PhotographKind
+from v2v_server.kinds.sequences import SequenceKind
+from v2v_server.kinds.videos import VideoKind
 from v2v_server.schedule import Schedule, SequenceTable
 from v2v_server.store import cache as caches
 from v2v_server.store import verified
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.photograph import kept_photographs
 from v2v_server.store.picture_sequence import PictureSequence
-from v2v_server.store.pixels import VideosKind
 from v2v_server.store.video_file import VideoFile
-from v2v_server.worker.process import Clips
-from v2v_server.worker.produce import make_sample
+from v2v_server.worker.job import ClipJob, SampleJob
+from v2v_server.worker.making.make import make_sample
+from v2v_server.worker.making.read import Clips
 from v2v_tools.remake import lease_for
 
 FRAMES, CHANGED = 126, 60
-FORMS = {"video": VideosKind(), "pictures": VideosKind("sequences", 25.0)}
+FORMS = {"video": VideoKind(), "pictures": SequenceKind(25.0)}
 SPEC = StreamSpec(recipe=Recipe(voxels_per_clip=4, bins=5, crop_height_px=24, crop_width_px=32))
 """Needs 21 frames."""
 
@@ -111,7 +114,8 @@ def made(leases: list[Lease], clips: Clips) -> list[bytes | None]:
     found: list[bytes | None] = []
     for lease in leases:
         try:
-            sample = make_sample(lease, clips.take(lease)[0])
+            job = SampleJob.of(lease)
+            sample = make_sample(job, clips.take(job.clip, lease.indices)[0])
             found.append(b"".join(array.tobytes() for array in sample.arrays.values()))
         except VideoChanged:
             found.append(None)
@@ -212,7 +216,7 @@ def test_what_changes_during_a_read_is_read_again(
         corpus.restore()
         left[0] = 100
         with pytest.raises(VideoUnreadable, match="changes while it is read"):
-            Clips(Folder(corpus.root)).take(affected)
+            Clips(Folder(corpus.root)).take(ClipJob.of(affected), affected.indices)
 
 
 def touched(path: Path) -> None:
@@ -264,7 +268,7 @@ def test_a_copy_on_another_host_is_read_whole_once(corpus: Corpus, read_whole: l
         read_whole.clear()
         source = Folder(other)
         files = {leases[0].video: leases[0].fingerprint}
-        source.expect(leases[0].video, leases[0].notes.state)
+        source.expected = leases[0].video, leases[0].notes.state
         assert not source.has(files), "this happens before a lease begins, so that no deadline runs"
         source.fetch(files)
         assert source.has(files)
@@ -347,7 +351,7 @@ def test_photographs_are_compared_when_they_are_decoded(tmp_path: Path, *, seen:
         contents.append((root / "a.bmp").read_bytes())
     file = root / "a.bmp"
     file.write_bytes(contents[0])
-    kind = VideosKind("photographs")
+    kind = PhotographKind()
     worlds = StreamSpec(recipe=preset("worlds").replace(crop_height_px=32, crop_width_px=40))
     with closing(open_catalogue(root, cache_dir=tmp_path / "index", kind=kind, processes=0)) as catalogue:
         leases = leases_of(catalogue, worlds)[:3]

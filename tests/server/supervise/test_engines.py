@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 
 from tests.server.supervise.toy_host import ToyHost
 from v2v_protocol.errors import UsageError
+from v2v_protocol.programs import install_line
 from v2v_server import config
 from v2v_server.broker.leases import Cause, Loss
 from v2v_server.config import ServeConfig
@@ -27,7 +29,7 @@ def test_the_usual_one_is_this_hosts_pool() -> None:
 def test_without_ray_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     monkeypatch.delitem(sys.modules, "v2v_server.supervise.ray_host", raising=False)
-    with pytest.raises(UsageError, match=r"needs the Python package ray.*pip install '\.\[ray\]'"):
+    with pytest.raises(UsageError, match=f"needs the Python package ray.*{re.escape(install_line('ray'))}"):
         make_pool(ServeConfig(**RAY), Folder(Path("videos")), "w", [])
 
 

@@ -6,35 +6,35 @@ import os
 import signal
 import stat
 
-from v2v_server.corpus.index import IndexRow
-from v2v_server.corpus.probe import probe_file
+from v2v_server.corpus.probe import ProbeJob, probe_file
 from v2v_server.corpus.sources.source import VideoSource
+from v2v_server.corpus.videos import IndexRow
 
 
-def lethal(source: VideoSource, id: str) -> IndexRow:
+def lethal(source: VideoSource, job: ProbeJob) -> IndexRow:
     """Dies over files of that name, as over a bug of the decoder."""
-    if "lethal" in id:
+    if "lethal" in job[0]:
         os.kill(os.getpid(), signal.SIGSEGV)
-    return probe_file(source, id)
+    return probe_file(source, job)
 
 
-def killed_once(source: VideoSource, id: str) -> IndexRow:
+def killed_once(source: VideoSource, job: ProbeJob) -> IndexRow:
     """Is killed from outside over each file, the first time."""
-    file = source.folder / id
+    file = source.folder / job[0]
     if not file.stat().st_mode & stat.S_ISVTX:  # such a process may write no file, but change a mode
         file.chmod(file.stat().st_mode | stat.S_ISVTX)
         os.kill(os.getpid(), signal.SIGKILL)
-    return probe_file(source, id)
+    return probe_file(source, job)
 
 
-def always_killed(source: VideoSource, id: str) -> IndexRow:
+def always_killed(source: VideoSource, job: ProbeJob) -> IndexRow:
     """Is killed from outside over every file."""
     os.kill(os.getpid(), signal.SIGKILL)
-    return probe_file(source, id)
+    return probe_file(source, job)
 
 
-def waiting(source: VideoSource, id: str) -> IndexRow:
+def waiting(source: VideoSource, job: ProbeJob) -> IndexRow:
     """Waits for ever over files of that name, as over storage that does not answer."""
-    if "waiting" in id:
+    if "waiting" in job[0]:
         signal.pause()
-    return probe_file(source, id)
+    return probe_file(source, job)

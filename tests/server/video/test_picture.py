@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from v2v_protocol.errors import UsageError
+from v2v_server.video.levels import add_colour, differences_of
 from v2v_server.video.picture import (
     ChromaCut,
     ChromaStack,
@@ -25,7 +26,6 @@ from v2v_server.video.picture import (
     stated_matrix,
     stretch,
 )
-from v2v_server.video.rgb import add_colour, differences_of
 from v2v_server.video.rows import Rows
 
 FORMATS = ("yuv420p", "yuvj420p", "yuv422p", "yuv444p", "yuv411p", "nv12", "nv21", "nv24", "yuv420p10le", "yuv444p12be")

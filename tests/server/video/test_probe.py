@@ -23,6 +23,7 @@ from v2v_protocol.errors import VideoError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import open_catalogue
+from v2v_server.corpus_words import notes_of
 from v2v_server.video.decode import decodes_as_listed
 from v2v_server.video.frame_index import FrameIndex
 from v2v_server.video.packets import is_hidden, is_scaled, may_be_not_coded, times_are_doubtful
@@ -509,7 +510,7 @@ def test_a_picture_that_grows_is_said_everywhere(tmp_path: Path) -> None:
     write_clip(videos / "whole.mp4", panned_luma(30))
     recipe = Recipe(voxels_per_clip=1, bins=5, crop_height_px=32, crop_width_px=32)
     with closing(open_catalogue(videos, cache_dir=tmp_path / "index", processes=0)) as catalogue:
-        (note,) = (note for note in catalogue.notes if "are left out" in note)
+        (note,) = (note for note in notes_of(catalogue) if "are left out" in note)
         assert note.startswith(
             "1 video is served in part, or with wrong grey levels or times (grows.ts: 50 of 80 pictures"
         )

@@ -25,23 +25,27 @@ from tests.server.prepare.test_prepare import run
 from v2v_protocol.errors import UsageError, VideoError
 from v2v_protocol.messages import Lease
 from v2v_protocol.recipe import Recipe, preset
-from v2v_protocol.sample import Sample
+from v2v_protocol.sample import DEFAULT_ARRAYS, Sample
 from v2v_protocol.spec import StreamSpec
+from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
 from v2v_server.corpus.scenes import picture_check
 from v2v_server.corpus.sources.folder import Folder
+from v2v_server.corpus_words import notes_of
 from v2v_server.prepare import prepare
+from v2v_server.schedule import VideoSequence
 from v2v_server.simulation.intensity import light_table
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.store.planes.detail import detail_of, levels_of
 from v2v_server.store.store_file import StoreFile
 from v2v_server.video.picture import Signal, range_table
 from v2v_server.video.rows import Rows
-from v2v_server.worker.process import Clips
-from v2v_server.worker.produce import make_sample
+from v2v_server.worker.job import SampleJob
+from v2v_server.worker.making.make import make_sample
+from v2v_server.worker.making.read import Clips
 from v2v_tools.motion import WholePictures
 from v2v_tools.preview import _signal_note
-from v2v_tools.remake import Remaker
+from v2v_tools.remake import Remaker, lease_for
 from v2v_tools.tradeoff.measures import Leases, seen, simulated
 
 RECIPE = Recipe(
@@ -129,7 +133,7 @@ def test_a_prepared_folder_has_colour_with_chroma_alone_whatever_else_it_has(tmp
         assert stored.planes >= {"chroma", "motion"}
     (prepared / "b.mp4").unlink()
     with closing(open_catalogue(prepared, processes=0)) as catalogue:
-        assert catalogue.notes
+        assert notes_of(catalogue)
         catalogue.facts.require_arrays(("frames_rgb",))
 
 
@@ -226,10 +230,11 @@ def test_the_cache_keeps_what_a_stream_needs(tmp_path: Path, kind: str) -> None:
     make_cache(tmp_path / "cache")
     clips = Clips(Folder(source), Cache(tmp_path / "cache", 1 << 30))
     for lease, said in ((plain, "miss"), (plain, "hit"), (full, "miss"), (full, "hit")):
-        decoded, _ = clips.take(lease)
+        job = SampleJob.of(lease)
+        decoded, _ = clips.take(job.clip, lease.indices)
         assert clips.said_of_cache(decoded) == said
         if said == "hit":
-            require_equal(make_sample(lease, decoded), whole_sample(lease, source), "cache")
+            require_equal(make_sample(job, decoded), whole_sample(lease, source), "cache")
 
 
 def test_preview_and_doctor_name_what_a_video_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -251,12 +256,17 @@ def test_deep_clips_offline(tmp_path: Path) -> None:
     spec = StreamSpec(recipe=DECLARED)
     with closing(open_catalogue(tmp_path / "clips", processes=0)) as catalogue:
         remaker = Remaker(catalogue, spec)
-        made = remaker.made(0, 0, 0)
-        whole = WholePictures(catalogue, spec).camera(remaker.sequence(0, 0, 0))
-        (view,) = seen(Leases(tmp_path / "clips", [replace(made.lease, indices=(0, 1))]), 0)
+        sample, job = remaker.sample(0, 0, 0), remaker.job(0, 0, 0)
+        whole = WholePictures(catalogue).camera(job)
+        sequence = VideoSequence(catalogue.videos[0], job.clip.start_frame)
+        lease = lease_for(
+            Request(b"", 0, 0), sequence=sequence, catalogue=catalogue, spec=spec, seed=0, arrays=DEFAULT_ARRAYS,
+            siblings=(1,),
+        )  # fmt: skip
+        (view,) = seen(Leases(tmp_path / "clips", [lease]), 0)
     assert whole.voxels.any()
-    voxels = simulated(view, made.sample.provenance.params)
-    np.testing.assert_array_equal(voxels, made.sample.arrays["voxels"])
+    voxels = simulated(view, sample.provenance.params).voxels
+    np.testing.assert_array_equal(voxels, sample.arrays["voxels"])
 
 
 def test_sub_steps_are_made_of_8_bits(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ import zmq
 
 from tests.oracles.dealers import wait
 from tests.protocol.persisted_values import example
+from tests.server.named_corpus import SMALL_SPEC
 from v2v_protocol import PROTOCOL_VERSION
 from v2v_protocol.errors import (
     RemoteError,
@@ -45,7 +46,7 @@ from v2v_protocol.messages import (
     decode,
     encode,
 )
-from v2v_protocol.sample import Layout, new_arrays
+from v2v_protocol.sample import new_arrays
 from v2v_server.commands.worker import main as worker_command
 from v2v_server.corpus.sources.folder import Folder
 from v2v_server.simulation.precision import Variant
@@ -64,9 +65,14 @@ from v2v_server.worker.conversation import (
     WorkerAction,
     WorkerConversation,
 )
-from v2v_server.worker.process import Clips, OutputBuffer, Worker, run_worker
+from v2v_server.worker.job import ClipJob, SampleJob
+from v2v_server.worker.making.read import Clips
+from v2v_server.worker.process import OutputBuffer, Worker, run_worker
 
-LEASE: Lease = replace(example(Lease), indices=(3,), arena="", slot=0)
+LEASE: Lease = replace(
+    example(Lease), indices=(3,), arena="", slot=0, spec=SMALL_SPEC.canonical(), rows="full", arrays=("frames",),
+    refusals={"refusals": []}, height_px=16, width_px=24, frames_per_second=25.0, thresholds=(),
+)  # fmt: skip
 HELLO = WorkerHello("w", 1, 2)
 IN_SLOT: Frames = [b"header"]
 IN_MESSAGE: Frames = [b"header", b"array"]
@@ -100,7 +106,7 @@ class Talk:
         self.unready: set[int] = set()
         self.compiled = True
         self.decoded: set[int] = set()
-        self.conversation = WorkerConversation(HELLO, "tcp://there", is_watched=is_watched)
+        self.conversation = WorkerConversation(HELLO, ("tcp://there",), is_watched=is_watched)
         self.step: WorkerAction = Leave()
         self._take(self.conversation.start(self.now))
         assert self.said() == [HELLO]
@@ -128,7 +134,7 @@ class Talk:
 
     def hears(self, *messages: Message) -> list[Message]:
         assert isinstance(self.step, Listen)
-        self._take(self.conversation.on_messages([encode(message)[0] for message in messages], self.now))
+        self._take(self.conversation.on_messages([(0, encode(message)[0]) for message in messages], self.now))
         return self.said()
 
     def makes(self, number: int, frames: Frames = IN_SLOT, seconds: float = 0.0) -> list[Message]:
@@ -233,13 +239,13 @@ def test_a_silent_server_is_greeted_over_a_new_connection() -> None:
 
 def test_a_message_is_waited_for_only_if_a_server_was_there_lately() -> None:
     talk = Talk()
-    found = [talk.conversation.has_server]
+    found = [talk.conversation.brokers[0].is_there]
     for message in (Pong(), None, Pong()):
         talk.now += 5.0
         talk.hears(*([] if message is None else [message]))
-        found.append(talk.conversation.has_server)
+        found.append(talk.conversation.brokers[0].is_there)
     assert found == [False, True, False, True]
-    assert at_work(1, 2).conversation.has_server
+    assert at_work(1, 2).conversation.brokers[0].is_there
 
 
 def test_the_time_that_a_sample_takes_is_no_silence() -> None:
@@ -255,7 +261,7 @@ def test_a_worker_that_cannot_read_its_server_reports_what_it_made_says_why_and_
     for unreadable, why in ((b"nonsense", "not a message"), (later, "Lease has no field 'rotation'")):
         talk = at_work(1)
         talk.makes(1)
-        talk._take(talk.conversation.on_messages([unreadable, encode(lease(3))[0]], talk.now))
+        talk._take(talk.conversation.on_messages([(0, unreadable), (0, encode(lease(3))[0])], talk.now))
         result, goodbye = talk.said()
         assert (result, type(goodbye)) == (Result(1, begins=0), Goodbye)
         assert isinstance(talk.step, Leave)
@@ -267,7 +273,7 @@ def test_a_server_of_another_version_ends_the_worker() -> None:
     """It says so in its own version, which is no message to ours; to ask it again every five seconds is no use."""
     denial = msgpack.packb({"v": PROTOCOL_VERSION + 1, "t": "denied", "code": "version", "text": "", "more": 0})
     with pytest.raises(VersionMismatch, match=f"version {PROTOCOL_VERSION + 1}"):
-        Talk().conversation.on_messages([denial], 0.0)
+        Talk().conversation.on_messages([(0, denial)], 0.0)
 
 
 def test_a_server_that_does_not_want_this_worker_ends_it() -> None:
@@ -337,7 +343,6 @@ class TestSiblings:
 # --- the process ------------------------------------------------------------------------------------------------------
 
 WAIT_MS = 60_000
-LAYOUT: Layout = {"voxels": ("int8", (2, 2))}
 VARIANT = Variant("int16", True, "float32")
 
 
@@ -360,37 +365,14 @@ class Server:
             self._router.send_multipart([self.worker, *encode(message)])
 
 
-@pytest.fixture
-def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Server]:
-    """Samples in slots. Lease 2 needs no decoding, lease 3 fails, lease 4 needs a kernel that is not loaded."""
-
-    def make(lease: Lease, *_: object) -> Any:
-        at.did.append(f"make {lease.lease}")
-        if lease.lease == 3:
-            raise VideoError("a.mp4", 7, "cut short")
-        return SimpleNamespace(provenance=SimpleNamespace(to_dict=dict))
-
-    with zmq.Context() as context, context.socket(zmq.ROUTER) as router, (tmp_path / "logbook").open("wb") as logbook:
+@contextmanager
+def working(folder: Path) -> Iterator[Server]:
+    """Lend a server whose worker has said hello and runs in a thread."""
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as router, (folder / "logbook").open("wb") as logbook:
         router.setsockopt(zmq.LINGER, 0)
         at = Server(router)
         port = router.bind_to_random_port("tcp://127.0.0.1")
-        worker = Worker("w", Folder(tmp_path), f"tcp://127.0.0.1:{port}", logbook.fileno())
-        monkeypatch.setattr(worker_module, "make_sample", make)
-        monkeypatch.setattr(worker_module, "sample_layout", lambda lease: LAYOUT)
-        monkeypatch.setattr(
-            worker_module,
-            "open_output_buffer",
-            lambda lease, layout, arenas: OutputBuffer(new_arrays(layout), in_slot=True),
-        )
-        monkeypatch.setattr(worker_module, "kernels_of", lambda lease: frozenset({VARIANT} if lease.lease > 3 else ()))
-        monkeypatch.setattr(worker_module, "is_compiled", lambda variant: True)
-        monkeypatch.setattr(worker_module, "load_in_turn", lambda variant: at.did.append("load"))
-        monkeypatch.setattr(worker_module, "give_way", lambda: at.did.append("give way"))
-        monkeypatch.setattr(
-            worker_module, "note", lambda _, lease, decodes=False: decodes or at.did.append(f"note {lease}")
-        )
-        monkeypatch.setattr(Clips, "take", lambda self, lease: (None, False))
-        monkeypatch.setattr(Clips, "has", lambda self, lease: lease.lease == 2)
+        worker = Worker("w", Folder(folder), [f"tcp://127.0.0.1:{port}"], logbook.fileno())
         thread = threading.Thread(target=worker.run)
         thread.start()
         try:
@@ -404,9 +386,53 @@ def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Server]:
             assert not thread.is_alive()
 
 
+@pytest.fixture
+def server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Server]:
+    """Samples in slots, whose indices are the numbers of their leases. Lease 2 needs no decoding, lease 3 fails, and
+    lease 4 needs a kernel that is not loaded.
+    """
+
+    def make(job: SampleJob, *_: object) -> Any:
+        at.did.append(f"make {job.index}")
+        if job.index == 3:
+            raise VideoError("a.mp4", 7, "cut short")
+        return SimpleNamespace(provenance=SimpleNamespace(to_dict=dict))
+
+    for name, replaced in {
+        "make_sample": make,
+        "open_output_buffer": lambda lease, layout, arenas: OutputBuffer(new_arrays(layout), in_slot=True),
+        "kernels_of": lambda clip: frozenset({VARIANT} if clip.start_frame == 4 else ()),
+        "is_compiled": lambda variant: True,
+        "load_in_turn": lambda variant: at.did.append("load"),
+        "give_way": lambda: at.did.append("give way"),
+        "note": lambda _, lease, decodes=False: decodes or at.did.append(f"note {lease}"),
+    }.items():
+        monkeypatch.setattr(worker_module, name, replaced)
+    monkeypatch.setattr(Clips, "take", lambda self, clip, indices: (None, False))
+    monkeypatch.setattr(Clips, "has", lambda self, clip, index: index == 2)
+    with working(tmp_path) as at:
+        yield at
+
+
+@pytest.mark.parametrize("damaged", ["frame_index", "scene"])
+def test_a_lease_with_a_damaged_part_fails_and_its_worker_goes_on(tmp_path: Path, damaged: str) -> None:
+    """The server passes on what its index on disk holds. Three deaths over it would cost the video all its readers."""
+    spec = replace(SMALL_SPEC, scene="auto" if damaged == "scene" else "off")
+    lease = replace(LEASE, video="a.mp4", spec=spec.canonical(), **{damaged: b"garbage"})  # type: ignore[arg-type]
+    with working(tmp_path) as server:
+        for number in (1, 2):
+            server.says(replace(lease, lease=number))
+            assert server.heard() == Begun(number)
+            failed = server.heard()
+            assert isinstance(failed, LeaseFailed)
+            assert (failed.lease, failed.here) == (number, False)
+            what = {"frame_index": "index", "scene": "scene"}[damaged]
+            assert failed.reason.startswith(f"its {what} from the server is damaged: {damaged.replace('_', ' ')} ")
+
+
 def test_it_makes_what_it_is_given_and_notes_what_it_is_at(server: Server) -> None:
     """Siblings are made in one turn on the core."""
-    server.says(*(replace(LEASE, lease=number) for number in range(1, 5)))
+    server.says(*(replace(LEASE, lease=number, indices=(number,), start_frame=number) for number in range(1, 5)))
     said = [server.heard()]
     while not isinstance(said[-1], Result) or said[-1].lease != 4:
         said.append(server.heard())
@@ -428,19 +454,25 @@ def test_sidecars_are_read_before_their_lease_begins(server: Server, monkeypatch
     """The time and memory that labels take count against no sample: nothing has begun, and the logbook says so."""
 
     @contextmanager
-    def opened(lease: Lease, source: object) -> Iterator[dict[str, None]]:
-        server.did.append(f"open {lease.lease}")
-        if lease.lease == 5:
+    def opened(clip: ClipJob, source: object) -> Iterator[dict[str, None]]:
+        server.did.append(f"open from {clip.start_frame}")
+        if clip.start_frame == 18:
             raise SidecarError("a.mp4", ".boxes/", "is gone", here=True)
         yield {}
 
     monkeypatch.setattr(worker_module, "open_sidecars", opened)
-    monkeypatch.setattr(worker_module, "kernels_of", lambda lease: frozenset())
+    monkeypatch.setattr(worker_module, "kernels_of", lambda clip: frozenset())
     labelled = replace(LEASE, video="a.mp4", arrays=("boxes",))
     starts = {1: 0, 2: 0, 4: 9, 5: 18}
     server.says(
         *(
-            replace(labelled, lease=number, start_frame=start, sidecars={".boxes/": ["3-x", b"the same files"]})
+            replace(
+                labelled,
+                lease=number,
+                indices=(number,),
+                start_frame=start,
+                sidecars={".boxes/": ["3-x", b"the same files"]},
+            )
             for number, start in starts.items()
         )
     )
@@ -449,10 +481,10 @@ def test_sidecars_are_read_before_their_lease_begins(server: Server, monkeypatch
         said.append(server.heard())
     assert said[-1] == LeaseFailed(5, None, "is gone", True, ".boxes/")
     assert [step for step in server.did if "way" not in step] == [
-        *("open 1", "note 1", "make 1", "note 0"),
+        *("open from 0", "note 1", "make 1", "note 0"),
         *("note 2", "make 2", "note 0"),
-        *("open 4", "note 4", "make 4", "note 0"),
-        *("open 5", "note 5", "note 0"),
+        *("open from 9", "note 4", "make 4", "note 0"),
+        *("open from 18", "note 5", "note 0"),
     ]
 
 
@@ -462,38 +494,38 @@ def test_a_new_connection_has_a_new_routing_id(tmp_path: Path) -> None:
         at = Server(router)
         port = router.bind_to_random_port("tcp://127.0.0.1")
         # Without the question of whose server it is, the handshake needs no call of the worker.
-        worker = Worker("w", Folder(tmp_path), f"tcp://127.0.0.1:{port}", insecure=True)
+        worker = Worker("w", Folder(tmp_path), [f"tcp://127.0.0.1:{port}"], insecure=True)
         found = []
         try:
             for _ in range(2):
                 worker._do(Send(encode(Ping())))
                 assert at.heard() == Ping()
                 at.says(Pong())
-                assert wait([worker._link], WAIT_MS / 1000)
-                assert [decode(frame) for frame in worker._messages(0.0)] == [Pong()]
+                assert wait(worker._links, WAIT_MS / 1000)
+                assert [(broker, decode(frame)) for broker, frame in worker._messages(0.0)] == [(0, Pong())]
                 found.append(at.worker)
                 worker._do(Reconnect())
         finally:
-            worker._link.close()
+            worker.close()
     assert len(set(found)) == 2
     assert all(len(identity) == 16 and identity != b"w" for identity in found)
 
 
 def test_a_worker_whose_server_is_away_keeps_to_the_ip_version(tmp_path: Path, unused_port: int) -> None:
     """With the other one it would not find the server again until its next new connection, minutes later."""
-    worker = Worker("w", Folder(tmp_path), f"tcp://localhost:{unused_port}")
+    worker = Worker("w", Folder(tmp_path), [f"tcp://localhost:{unused_port}"])
     try:
         for _ in range(3):
             worker._do(Reconnect())
-            assert worker._link._socket is not None
-            assert worker._link._socket.getsockopt(zmq.IPV6) == 0
+            assert worker._links[0]._socket is not None
+            assert worker._links[0]._socket.getsockopt(zmq.IPV6) == 0
     finally:
-        worker._link.close()
+        worker.close()
 
 
 def test_a_malformed_address_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"--connect: address 'nowhere': .*; give tcp://host:port"):
-        Worker("w", Folder(tmp_path), "nowhere")
+        Worker("w", Folder(tmp_path), ["nowhere"])
 
 
 def test_a_corpus_that_cannot_be_looked_at_is_said(capsys: pytest.CaptureFixture[str]) -> None:
@@ -513,23 +545,54 @@ def test_workers_in_containers_of_one_name_do_not_share_theirs(monkeypatch: pyte
             pass
 
     monkeypatch.setattr(worker_module, "Worker", Named)
-    for asks_the_system in ("keep_freed_memory", "limit_memory", "confine", "warm_up_in_turn", "take_long_turns"):
-        monkeypatch.setattr(worker_module, asks_the_system, lambda *_, **__: None)
+    for asks in ("_ask", "keep_freed_memory", "limit_memory", "confine", "warm_up_in_turn", "take_long_turns"):
+        monkeypatch.setattr(worker_module, asks, lambda *_, **__: None)
     monkeypatch.setattr(worker_module, "gc", SimpleNamespace(collect=lambda: 0, freeze=lambda: None))
     monkeypatch.setattr(worker_module, "signal", SimpleNamespace(SIGTERM=15, signal=lambda number, handler: None))
     monkeypatch.setenv("OPENCV_FOR_THREADS_NUM", "1")
     for name in (None, None, "mine"):
-        run_worker("tcp://127.0.0.1:5556", Folder(tmp_path), name, None)
+        run_worker(["tcp://127.0.0.1:5556"], Folder(tmp_path), name, None)
     assert len(set(names)) == 3
     assert names[0].startswith(f"{socket.gethostname()}-{os.getpid()}-")
     assert names[2] == "mine"
+
+
+@pytest.mark.parametrize("answers", [False, True])
+def test_a_server_that_does_not_answer_is_named_before_the_kernels_are_compiled(
+    answers: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """A server without keys never answers another user, and compiling takes a minute on a new host."""
+    said: list[str] = []
+
+    def compile_kernels() -> None:
+        said.append(capsys.readouterr().err)
+        raise InterruptedError
+
+    monkeypatch.setattr(worker_module, "warm_up_in_turn", compile_kernels)
+    monkeypatch.setattr(worker_module, "limit_memory", lambda _: None)
+    monkeypatch.setattr(worker_module, "_ASK_SECONDS", 60.0 if answers else 0.3)
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as server:
+        server.linger = 0
+        port = server.bind_to_random_port("tcp://127.0.0.1")
+
+        def answer() -> None:
+            peer, *_ = server.recv_multipart()
+            server.send_multipart([peer, *encode(Denied(ErrorCode.UNKNOWN_SESSION, "say WorkerHello"))])
+
+        thread = threading.Thread(target=answer if answers else bool)
+        thread.start()
+        with pytest.raises(InterruptedError):
+            run_worker([f"tcp://127.0.0.1:{port}"], Folder(tmp_path), None, None)
+        thread.join()
+    assert (said == [""]) == answers
+    assert answers or f"tcp://127.0.0.1:{port}: a server listens there, and does not answer yet" in said[0]
 
 
 def test_workers_that_are_given_one_name_do_not_share_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A batch system starts all of them with the same command."""
     names: list[str] = []
     monkeypatch.setattr(
-        "v2v_server.commands.worker.run_worker", lambda address, root, name, *_, **__: names.append(name)
+        "v2v_server.commands.worker.run_worker", lambda brokers, root, name, *_, **__: names.append(name)
     )
     command = ["--connect", "tcp://127.0.0.1:5556", "--videos", str(tmp_path), "--name", "node7"]
     for more in ([], [], ["--logbook-fd", "3"]):

@@ -16,6 +16,7 @@ from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import ALONE_AFTER, Cause
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.quarantine import Quarantine, QuarantineEntry, clearing
+from v2v_server.worker.job import ClipJob, SampleJob
 from v2v_tools import remake as remake_module
 from v2v_tools.remake import remake
 
@@ -78,7 +79,7 @@ def test_a_crash_or_a_hang_refuses_the_begun_candidate_at_once(cause: Cause) -> 
     assert at.samples() == [(0, 0), (0, 1)]
     # The operator reads the verdict; what the quarantine refuses from then on is no news.
     assert at.passed_over == []
-    assert at.dispatcher.counters.refused_candidates == 1
+    assert at.broker.counters.refused_candidates == 1
 
 
 @pytest.mark.parametrize("answered", [True, False])
@@ -138,7 +139,7 @@ def test_unexplained_deaths_make_it_run_alone_and_one_more_refuses_it() -> None:
     at.join()
     # Alone on its worker, though that has room and others wait.
     assert [lease.indices for lease in at.leases[b"w"]] == [(0,)]
-    assert at.dispatcher.waiting == 3
+    assert at.broker.waiting == 3
     at.join(b"other")
     assert [lease.indices for lease in at.leases[b"other"]] == [(1,), (2,)]
     at.begin()
@@ -187,13 +188,13 @@ def test_a_consumer_that_leaves_takes_its_lone_task_along_and_frees_the_worker_k
     at.join(b"w2", credit=3)
     at.die(b"w1", Cause.KILLED)
     at.finish(b"w2")
-    assert (at.dispatcher.waiting, len(at.leases[b"w2"])) == (6, 2)
+    assert (at.broker.waiting, len(at.leases[b"w2"])) == (6, 2)
     at.dispatcher.consumer_lost(b"c")
-    assert at.dispatcher.waiting == 5
+    assert at.broker.waiting == 5
     at.tick(0.1)
     assert len(at.leases[b"w2"]) == 3
     at.work_off(b"w2")
-    assert (at.dispatcher.waiting, len(at.samples(b"other"))) == (0, 8)
+    assert (at.broker.waiting, len(at.samples(b"other"))) == (0, 8)
 
 
 # --- the verdict ------------------------------------------------------------------------------------------------------
@@ -350,21 +351,25 @@ def remade(
     failing: tuple[str, ...] = (),
     catalogue: Catalogue = VIDEOS,
     spec: StreamSpec = SMALL_SPEC,
-) -> Lease:
-    """The lease that remake() works on in the end, when these videos cannot be decoded."""
-    leases: list[Lease] = []
+) -> SampleJob:
+    """The job that remake() works on in the end, when these videos cannot be decoded."""
+    jobs: list[SampleJob] = []
 
-    def decode_for(lease: Lease, indices: tuple[int, ...], root: object) -> tuple[Lease]:
+    def decode_for(clip: ClipJob, indices: tuple[int, ...], root: object) -> tuple[None]:
         assert indices == (index,)
-        if lease.video in failing:
-            raise VideoError(lease.video, 7, "cut short")
-        leases.append(lease)
-        return (lease,)
+        if clip.video in failing:
+            raise VideoError(clip.video, 7, "cut short")
+        return (None,)
+
+    def make_sample(job: SampleJob, decoded: None, sidecars: object) -> Sample:
+        jobs.append(job)
+        return cast(Sample, job)
 
     monkeypatch.setattr(remake_module, "decode_for", decode_for)
-    monkeypatch.setattr(remake_module, "make_sample", lambda lease, decoded, sidecars: cast(Sample, decoded))
+    monkeypatch.setattr(remake_module, "make_sample", make_sample)
     remake(catalogue, spec, seed=0, epoch=0, index=index, arrays=("voxels",), quarantine=quarantine, snapshot=snapshot)
-    return leases[0]
+    (job,) = jobs
+    return job
 
 
 def test_remake_chooses_what_the_dispatcher_chose(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -397,7 +402,7 @@ def test_remake_chooses_what_the_dispatcher_chose(monkeypatch: pytest.MonkeyPatc
     assert any(len(lease.refusals["refusals"]) > 1 for lease in done)
     for lease in done:
         again = remade(monkeypatch, at.quarantine, lease.quarantine, lease.indices[0], failing)
-        assert replace(again, lease=lease.lease) == lease
+        assert again == SampleJob.of(lease)
 
 
 def test_remake_says_what_the_dispatcher_says_when_nothing_is_left(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -132,7 +132,7 @@ def test_workers_neither_compile_nor_grow(tmp_path: Path) -> None:
         "from v2v_server.simulation.pixel import words\n"
         "from v2v_server.worker.warm_up import warm_up_in_turn\n"
         "warm_up_in_turn()\n"
-        "from v2v_server.video.full_range import to_full_range\n"
+        "from v2v_server.video.levels import to_full_range\n"
         "kernels = simulate_pixels, simulate_general, words, to_full_range\n"
         "print(*(sum(kernel.stats.cache_hits.values()) for kernel in kernels))\n"
         "print(*(sum(kernel.stats.cache_misses.values()) for kernel in kernels))\n"

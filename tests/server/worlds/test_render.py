@@ -14,16 +14,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.oracles.known_motion import photograph
-from tests.oracles.worlds import Oracle, event_errors
+from tests.oracles.worlds import Oracle, event_errors, waves
 from tests.server.simulation.generic_processor import COMPILE_SECONDS, printed_on_a_generic_processor
 from v2v_protocol.recipe import PRESETS, Recipe
+from v2v_protocol.spec import StreamSpec
 from v2v_server.simulation.draw import draw
 from v2v_server.worlds.render import (
-    WHITEST,
     PhotoPyramid,
     flow_of,
     levels_between,
     masks_of,
+    parts_by_change,
+    parts_by_motion,
     pyramid_of,
     render,
     tracks_of,
@@ -186,8 +188,8 @@ def test_any_photograph_and_any_draw_give_levels_and_numbers(
     pictures = render(pyramid_of(grey), world, times)
     low, high = int(grey.min()), int(grey.max())
     white = 65535 if deep else 255
-    assert pictures.min() >= low * WHITEST // white
-    assert pictures.max() <= -(-high * WHITEST // white)
+    assert pictures.min() >= low * 4095 // white
+    assert pictures.max() <= -(-high * 4095 // white)
     flow, valid = flow_of(world, 0.0, 1.0)
     assert np.isfinite(flow).all()
     assert set(np.unique(valid)) <= {0, 1}
@@ -202,23 +204,22 @@ def test_levels_between_are_pictures_at_their_times() -> None:
     )
     world, seconds = world_of(recipe, 1), np.arange(5) / 60
     source = np.array([0, 1, 1, 2, 3])
-    levels = levels_between(pyramid(), world, seconds, source, 1.0, 16)
+    levels = levels_between(pyramid(), world, seconds, source, parts_by_motion(world, seconds, 1.0, 16))
     assert levels is not None
     step, share = levels.at
     assert set(step.tolist()) == {0, 2, 3}
     assert 2 <= np.bincount(step)[0] <= 15
     at = seconds[source[step]] + share / 60
     np.testing.assert_array_equal(levels.grey, render(pyramid(), world, at)[:, :, ::-1])
-    few = levels_between(pyramid(), world, seconds, source, 3.0, 16)
+    few = levels_between(pyramid(), world, seconds, source, parts_by_motion(world, seconds, 3.0, 16))
     assert few is None or len(few.grey) < len(levels.grey)
     still = world_of(RECIPE.replace(world_still_share=1.0, world_patches=0), 1)
-    assert levels_between(pyramid(), still, seconds, source, 1.0, 16) is None
+    assert levels_between(pyramid(), still, seconds, source, parts_by_motion(still, seconds, 1.0, 16)) is None
 
 
 # --- events against the exact crossings of the light ------------------------------------------------------------------
 
 GREY = (40.0, 250.0)
-HZ = 60.0
 
 
 @pytest.mark.parametrize(
@@ -226,18 +227,59 @@ HZ = 60.0
     [(32.0, 0.5, 0.3), (32.0, 2.0, 0.1), (32.0, 8.0, 0.1), (32.0, 8.0, 0.3), (100.0, 8.0, 0.3)],
 )
 def test_signed_events_are_off_by_at_most_two_percent(period_px: float, px_per_frame: float, threshold: float) -> None:
-    """Levels between frames are rendered, not guessed; `python -m tests.oracles.worlds` prints the rest."""
-    found = event_errors(GREY, period_px, px_per_frame * HZ, threshold, HZ, substep_px=1.0)
+    """Levels between frames are rendered, not guessed; `python -m bench worlds` prints the rest."""
+    found = event_errors(waves(GREY, period_px), StreamSpec(substep_px=1.0), px_per_frame, threshold)
     assert found.signed <= 0.02
     assert abs(found.count) <= 0.02
 
 
 def test_sub_steps_restore_what_a_fast_pattern_loses() -> None:
     """A period a frame: without them, the frames hardly differ."""
-    coarse, fine = (event_errors(GREY, 8.0, 8.0 * HZ, 0.1, HZ, substep_px) for substep_px in (0.0, 0.5))
+    photograph = waves(GREY, 8.0)
+    coarse, fine = (event_errors(photograph, StreamSpec(substep_px=px), 8.0, 0.1) for px in (0.0, 0.5))
     assert coarse.count < -0.5
     assert abs(fine.count) < 0.02
     assert fine.signed <= 0.02
+
+
+FINE = StreamSpec(PRESETS["worlds-fine"])
+
+
+def test_sixteen_bits_show_what_moves_slowly() -> None:
+    """A tenth of a pixel a frame: half a level of 12 bits is much of what changes."""
+    coarse, fine = (event_errors(waves(GREY, 32.0), spec, 0.1, 0.1) for spec in (StreamSpec(), FINE))
+    assert coarse.signed > 0.03
+    assert fine.signed < 0.01
+
+
+@pytest.mark.parametrize("px_per_frame", [0.5, 2.0, 8.0])
+def test_steps_divided_by_threshold_miss_little(px_per_frame: float) -> None:
+    for threshold in (0.1, 0.3):
+        assert event_errors(waves(GREY, 12.0), FINE, px_per_frame, threshold).signed <= 0.015
+    plain = event_errors(photo(), StreamSpec(), px_per_frame, 0.1)
+    fine = event_errors(photo(), FINE, px_per_frame, 0.1)
+    assert fine.signed <= 0.01 < plain.signed
+
+
+def test_most_of_the_changing_pixels_change_by_the_share_at_most() -> None:
+    """At a still camera no step is divided; the change of a sub-step is that of its own light."""
+    seconds = np.arange(9) / 60
+    logs = np.log(0.001 + np.linspace(0.0, 1.0, 4096) ** 2.2).astype(np.float32)
+    changes, divided = np.stack([logs / 0.2, logs / 0.3]), 0
+    for index in range(6):
+        world = world_of(RECIPE.replace(world_speed_px=[5.0, 120.0]), index)
+        parts = parts_by_change(pyramid(), world, seconds, changes, 0.5, 16)
+        divided += int(np.count_nonzero((parts > 1) & (parts < 16)))
+        for step in np.flatnonzero(parts < 16):
+            at = seconds[step] + np.arange(parts[step] + 1) / (60 * parts[step])
+            levels = render(pyramid(), world, at).reshape(len(at), -1)
+            brighter, darker = (np.diff(table[levels], axis=0) for table in changes)
+            change = np.maximum(brighter, -darker)
+            # Light is looked at at the beginning of the step, in one of 16 pixels.
+            assert np.quantile(change[change > 0], 0.99) <= 0.5 * 1.35
+    assert divided > 6
+    still = world_of(RECIPE.replace(world_still_share=1.0, world_patches=0), 1)
+    assert (parts_by_change(pyramid(), still, seconds, changes, 0.5, 16) == 1).all()
 
 
 # --- the same bytes everywhere ----------------------------------------------------------------------------------------
@@ -266,7 +308,7 @@ def digests() -> dict[str, str]:
         world = draw_world(
             recipe, params, seed=SEED, epoch=3, index=index, picture_px=(97, 131), seconds=(0.0, 1.0)
         )  # fmt: skip
-        levels = levels_between(pyramid, world, seconds, np.arange(31), 1.0, 16)
+        levels = levels_between(pyramid, world, seconds, np.arange(31), parts_by_motion(world, seconds, 1.0, 16))
         arrays = {
             "pictures": render(pyramid, world, seconds),
             "levels": np.empty(0) if levels is None else levels.grey,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import struct
 import sys
 from pathlib import Path
@@ -17,6 +18,7 @@ from tests.trainer.convert.aedat4_file import write_aedat4
 from tests.trainer.convert.scene import scene
 from trainer.convert import cli, convert
 from v2v_protocol.errors import UsageError
+from v2v_protocol.programs import install_line
 from v2v_recordings import text_events
 from v2v_recordings.faery_reader import _errors_of_faery
 from v2v_recordings.items import ConvertOptions, EventChunk, SensorSize
@@ -244,7 +246,7 @@ def test_a_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     for module in ("faery", "rosbags", "rosbags.rosbag1"):
         if module.startswith(package):
             monkeypatch.setitem(sys.modules, module, None)
-    remedy = rf"needs the Python package {package}, .*: pip install '\.\[convert\]' in a checkout of v2v-stream$"
+    remedy = rf"needs the Python package {package}, .*: {re.escape(install_line('convert'))}$"
     with pytest.raises(UsageError, match=remedy):
         convert(source, tmp_path / "a.h5")
 

@@ -10,8 +10,9 @@ import h5py
 import numpy as np
 import pytest
 
-from trainer.convert import convert, writer
+from trainer.convert import convert
 from v2v_recordings import hdf5, text_events
+from v2v_recordings import layout_writer as writer
 
 
 def write_mvsec(path: Path, events: int) -> Path:

@@ -33,9 +33,11 @@ from v2v_tools.fit.statistics import simulate_recording
 LIGHT = Light.parse("2.2")
 FAST = TrueCamera(0.2, 0.26, shot_noise_hz=3.0, leak_hz=0.0, refractory_seconds=5e-4, log_eps=0.01)
 IGNORING = TrueCamera(0.23, 0.21, shot_noise_hz=3.0, refractory_seconds=1e-3, log_eps=0.01, noise_ignores=True)
+ALTERNATING = TrueCamera(0.2, 0.23, 0.12, leak_hz=0.2, log_eps=0.01, band_share=0.24, band_hz=28.0)
 SLOW = TrueCamera(0.25, 0.21, 0.12, 0.4, 0.6, 0.0, 60.0, log_eps=0.01)
 
 
+STILL = Film(np.full((481, 24, 32), 0.5, np.float32), 240)
 film = lru_cache(maxsize=3)(rendered_film)
 
 
@@ -69,6 +71,20 @@ def test_a_camera_with_low_pass_mismatch_and_leak_is_found_again() -> None:
     corner = fitted(SLOW).estimates["photoreceptor_hz"]
     assert corner.told
     assert corner.low <= 1 / SLOW.photoreceptor_hz <= corner.high
+
+
+@pytest.mark.slow
+def test_noise_that_alternates_is_told_as_nothing_else() -> None:
+    made = fitted(ALTERNATING)
+    check(made.estimates, ALTERNATING, ("threshold_pos", "threshold_neg"))
+    for name in ("shot_noise_hz", "leak_hz"):
+        assert not made.estimates[name].told
+        assert "events of still pixels alternate" in made.left_out[name]
+    assert not {"shot_noise_hz", "leak_hz", "hot_pixel_share", "hot_pixel_sigma"} & made.camera.keys()
+    text = " ".join(report_lines(made, "x"))
+    assert "obeys it" not in text  # no noise event is known that could tell
+    static = fit(dataclasses.replace(recording_of(ALTERNATING, STILL), frames=np.empty((0, 0), np.uint8)), static=True)
+    assert {"shot_noise_hz", "leak_hz", "dead_pixel_share"} <= static.left_out.keys()
 
 
 def check(estimates: Mapping[str, Estimate], camera: TrueCamera, names: tuple[str, ...]) -> None:
@@ -125,6 +141,62 @@ def test_noise_is_that_of_pixels_whose_neighbours_are_quiet_too() -> None:
     found = estimators.shot_noise(still, made.blocks(), np.zeros(side**2, np.bool_))
     assert found.told
     assert found.low <= hz <= found.high
+
+
+def still_events(
+    rng: np.random.Generator, counts: npt.NDArray[np.int64], on_share: npt.NDArray[np.float64], turns: float
+) -> Recorded:
+    """Return events of still pixels: signs are drawn for each pixel, or turn with a probability after the first."""
+    owner = np.repeat(np.arange(len(counts)), counts)
+    p = rng.random(len(owner)) < on_share[owner]
+    for at in np.flatnonzero(np.diff(owner) == 0) + 1 if turns else ():
+        p[at] = p[at - 1] != (rng.random() < turns)
+    t = rng.integers(100_000, 3_900_000, len(owner))
+    frames, frame_us = np.full((41, 32, 32), 100, np.uint8), np.arange(41) * 100_000
+    t = t[np.lexsort((t, owner))]
+    return recorded(32, 32, t, owner, p, frames, frame_us, light=LIGHT)
+
+
+@settings(max_examples=15)
+@given(st.floats(0.3, 8.0), st.floats(0.0, 1.5), st.floats(0.0, 1.0), st.integers(0, 99))
+def test_signs_that_alternate_are_not_those_of_shot_noise_and_leak(
+    rate: float, spread: float, on_share: float, seed: int
+) -> None:
+    """Rates and shares of signs differ from pixel to pixel, however far."""
+    rng = np.random.default_rng(seed)
+    counts = rng.poisson(rate * rng.lognormal(-(spread**2) / 2, spread, 1024)).astype(np.int64)
+    shares = np.clip(on_share + rng.normal(0, 0.2, 1024), 0, 1)
+    no_hot, everywhere = np.zeros(1024, np.bool_), np.ones((40, 1024), np.bool_)
+    assert estimators.unexplained(still_events(rng, counts, shares, 0.0), everywhere, no_hot) == ""
+    if np.maximum(counts - 1, 0).sum() > 100:
+        made = still_events(rng, counts, shares, 0.85)
+        assert "events of still pixels alternate" in estimators.unexplained(made, everywhere, no_hot)
+
+
+@pytest.mark.parametrize(
+    ("count", "one_sign", "said"), [(19.5, True, "barely beyond"), (25.0, True, ""), (19.5, False, "with both signs")]
+)
+def test_a_share_of_hot_pixels_is_at_most_one(count: float, one_sign: bool, said: str) -> None:
+    """Pixels barely above the others, as noise of uneven rates has them, are the tail of an endless distribution."""
+    is_hot = np.arange(1024) < 20
+    on = np.where(is_hot, count if one_sign else count / 2, 2.0)
+    off = np.where(is_hot, 0.0 if one_sign else count / 2, 2.0)
+    still = np.repeat(np.stack([np.full(1024, 2.0), np.zeros(1024), on, off])[:, :, None] / 4, 4, axis=2)
+    blocks = np.random.default_rng(0).integers(0, 64, 1024)
+    share, sigma = estimators.hot_pixels(still, is_hot, (0.2, 0.2), 0.0, blocks)
+    assert said in share.note
+    assert share.told == sigma.told == (not said)
+    assert said or 0.0 < share.low <= share.value <= share.high <= 1.0
+
+
+@pytest.mark.parametrize("period", [Estimate(1e-3, 9e-4, 1.1e-3, 1e-4, "x"), Estimate(1e-3, 0.0, 9e-3, 1e-4, "x")])
+@pytest.mark.parametrize("note", ["x", "noise ignores it: 90 intervals of any two signs end before 900 us"])
+@pytest.mark.parametrize("shot", [Estimate(3.0, 2.9, 3.1), Estimate(1e-9, 0.0, 1e-9), Estimate(np.nan, np.nan, np.nan)])
+def test_a_report_says_once_whether_noise_obeys_the_period(period: Estimate, note: str, shot: Estimate) -> None:
+    given = dataclasses.replace(period, note=note)
+    said = estimators.with_noise(given, shot, np.full(100_000, 5e3)).note
+    assert said.count("obeys it") + said.count("ignores it:") <= 1
+    assert ("obeys it" in said) == (note == "x" and given.told and shot.value == 3.0)
 
 
 @pytest.mark.parametrize(

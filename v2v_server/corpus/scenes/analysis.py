@@ -25,7 +25,6 @@ four of every eight frames, rounded to 1/64 px a frame.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from contextlib import nullcontext
 from itertools import islice
 
 import cv2
@@ -48,7 +47,16 @@ from v2v_server.corpus.scenes.scene import (
     Scene,
     Sides,
 )
-from v2v_server.corpus.scenes.stretches import bars_of, change_of, duplicated, is_cut, is_flat, is_still, pieces_of
+from v2v_server.corpus.scenes.stretches import (
+    bars_of,
+    change_of,
+    duplicated,
+    halt_before,
+    is_cut,
+    is_flat,
+    is_still,
+    pieces_of,
+)
 from v2v_server.flow import DIS_ULTRAFAST, GreyPicture, dis, one_thread
 
 DARK_BELOW_LEVEL = 16
@@ -66,6 +74,10 @@ _LEAST_JUMP_PACE = 0.2
 _JUMP_REACH = 8
 """Steps."""
 _LARGEST_RETURN = 0.5
+_KEPT_FRAMES = 9
+"""Those whose blocks are kept, for halts of up to seven steps."""
+_PIXEL_NOISE = 4
+"""Grey levels."""
 _BARS_EVERY = 8
 """Frames."""
 _COMB_LEVELS = 5
@@ -91,7 +103,7 @@ class SceneAnalysis:
     def __init__(self) -> None:
         self._search = dis(DIS_ULTRAFAST, 1)
         self._frames = 0
-        self._blocks: list[npt.NDArray[np.int64]] = []  # of the last four frames, 1/64 grey level each
+        self._blocks: list[npt.NDArray[np.int64]] = []  # of the last frames, 1/64 grey level each
         self._last: GreyPicture | None = None
         self._reduced: tuple[int, GreyPicture] | None = (
             None  # a frame from which motion is to be measured, and its number
@@ -100,6 +112,8 @@ class SceneAnalysis:
         self._variances: list[float] = []
         self._light: list[int] = []  # 1/64 grey level
         self._step_changes: list[int] = []  # of `change_of`
+        self._pixel_changes: list[int] = []  # of `_pixel_change`
+        self._halts: list[bool] = []  # of `halt_before`
         self._still: list[bool] = []
         self._flat: list[bool] = []
         self._bars: list[tuple[int, Sides]] = []
@@ -114,8 +128,7 @@ class SceneAnalysis:
 
     def add(self, picture: GreyPicture) -> None:
         """Add the next frame: [h, w] uint8, full-range luma, upright, of the size of the others."""
-        # OpenCV has work only in the first two of four frames.
-        with one_thread() if self._frames % LAG_FRAMES < 2 else nullcontext():
+        with one_thread():
             self._add(np.ascontiguousarray(picture))
 
     def _add(self, picture: GreyPicture) -> None:
@@ -125,19 +138,22 @@ class SceneAnalysis:
         self._variances.append(_covariance(blocks, blocks) / blocks.size**2)
         self._light.append(int(blocks.sum()) // blocks.size)
         self._flat.append(is_flat(blocks))
-        self._still.append(is_still(self._blocks[0] if self._blocks else blocks, blocks))
+        self._still.append(is_still((self._blocks[-LAG_FRAMES:] or [blocks])[0], blocks))
         if number % _BARS_EVERY == 0 and not self._flat[-1]:
             self._bars.append((number, bars_of(picture)))
-        if self._blocks:
+        if self._last is not None:
             self._step_changes.append(change_of(self._blocks[-1], blocks))
+            self._pixel_changes.append(_pixel_change(self._last, picture))
+            count = halt_before([*self._blocks, blocks], self._step_changes, self._pixel_changes)
+            self._halts[number - 1 - count :] = [True] * count + [False]
             if number % LAG_FRAMES == 0:
                 self._combed.append((number, _is_combed(picture, np.abs(blocks - self._blocks[-1]))))
             self._steps.append(_difference(self._blocks[-1], blocks))
             self._news.append(_unexplained(self._blocks[-1], blocks))
-            self._changes.append(_largest(np.abs(blocks - self._blocks[0])) / 64)
+            self._changes.append(_largest(np.abs(blocks - self._blocks[-LAG_FRAMES:][0])) / 64)
         if len(self._blocks) > 1:
             self._returns.append(_difference(self._blocks[-2], blocks))
-        self._blocks = [*self._blocks, blocks][-LAG_FRAMES:]
+        self._blocks = [*self._blocks, blocks][-_KEPT_FRAMES:]
         if number % SEGMENT_FRAMES == 1 and self._last is not None:
             self._noises.append((number, _noise(self._last, picture)))
         if number % LAG_FRAMES == 0:
@@ -184,7 +200,7 @@ class SceneAnalysis:
             row[FLICKER] = rippled.mean() if len(rippled) else 0.0
             row[NOISE] = next((noise for frame, noise in self._noises if low <= frame < high), np.nan)
         quiet = np.repeat(values[:, CHANGE].mean(axis=1) < _QUIET_CHANGE, SEGMENT_FRAMES)[: self._frames]
-        repeats = duplicated(self._step_changes, self._blocks[-1].size, boundaries)
+        repeats = duplicated(self._step_changes, np.array(self._halts, bool), self._blocks[-1].size, boundaries)
         assert self._last is not None
         pieces = pieces_of(
             np.array(self._light), np.array(self._variances), np.array(self._still), np.array(self._flat), quiet,
@@ -243,6 +259,13 @@ def block_sums(picture: GreyPicture) -> npt.NDArray[np.int64]:
     sums = (words & _EVEN_BYTES).sum(axis=1) + ((words >> np.uint64(8)) & _EVEN_BYTES).sum(axis=1)
     blocks: npt.NDArray[np.int64] = ((sums * _EACH_WORD) >> np.uint64(48)).astype(np.int64)
     return blocks
+
+
+def _pixel_change(before: GreyPicture, after: GreyPicture) -> int:
+    """Return the sum of the squared changes of all pixels, without what a coder may change of each, grey level^2."""
+    change = cv2.absdiff(before, after)
+    cv2.subtract(change, _PIXEL_NOISE, dst=change)  # type: ignore[call-overload]
+    return int(cv2.norm(change, cv2.NORM_L2SQR))
 
 
 def _covariance(first: npt.NDArray[np.int64], second: npt.NDArray[np.int64]) -> int:

@@ -218,9 +218,11 @@ def look_at_pictures(
     Returns:
         the defects that were found, by id.
     """
-    if not catalogue.source.is_local or catalogue.source.kind.is_rendered:
+    if not (catalogue.source.is_local and catalogue.kind.has_scenes):
         why = (
-            "these videos lie on another host" if not catalogue.source.is_local else "photographs have no such defects"
+            f"{catalogue.kind.name} have no such defects"
+            if catalogue.source.is_local
+            else "these videos lie on another host"
         )
         yield "ok", "pictures", f"not looked at: {why}", ""
         return {}
@@ -274,7 +276,7 @@ def check_in_background(
     Returns:
         the thread; None where nothing is looked at, as for a corpus on another host.
     """
-    if spec.scene != "off" or not catalogue.source.is_local or catalogue.source.kind.is_rendered:
+    if spec.scene != "off" or not (catalogue.source.is_local and catalogue.kind.has_scenes):
         return None
     excerpts = list(
         spread_excerpts(catalogue, _SERVED_VIDEOS, _LONGEST_SECONDS)

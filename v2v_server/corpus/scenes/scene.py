@@ -18,7 +18,7 @@ import numpy.typing as npt
 from v2v_protocol.errors import ProtocolError
 from v2v_server.video.frame_index import inflated
 
-ANALYSIS_VERSION = 5
+ANALYSIS_VERSION = 6
 """Raise it with every change of what an analysis finds: earlier ones are then repeated."""
 SEGMENT_FRAMES = 16
 """Frames of a segment. Segment i of a video holds frames 16 i .. 16 i + 15."""
@@ -39,7 +39,7 @@ CONTRAST, DARK, CLIPPED, FLICKER, NOISE = range(2 * TILES**2, 2 * TILES**2 + 5)
 COLUMNS = NOISE + 1
 _UNITS = np.array([64.0] * TILES**2 + [64.0] * TILES**2 + [64.0, 1000.0, 1000.0, 64.0, 64.0])
 """How many of each column's units make one pixel, grey level or whole."""
-_MAGIC = b"VSC5"
+_MAGIC = b"VSC6"
 _HEADER = struct.Struct("<4sIIHI")  # magic, first, end, segments, pieces
 
 

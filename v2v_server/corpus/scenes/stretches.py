@@ -17,16 +17,20 @@ Repeats: the change of a step is the sum of the squared changes of the means of 
 more than a grey level. Means of blocks hold little coder noise, and squares give most weight to moving edges. It is
 compared with the steps around it, up to four on either side.
 
-    pattern   A step is a repeat if its change is at most 1/5 (almost half of the amplitude) of the second largest
-              around it: coders with few bits blend a repeat with its neighbours. A pattern is a period of 2 to 12
-              steps in which four fifths of the steps at some places are such repeats, and at most half at the other
-              places, in one shot.
-    single    A step is a repeat if its change is at most 1/12 of that of each of the four steps before and after,
+A halt is one small step, or up to seven, between two that are at least five times as large, of blocks and of pixels.
+What swings or flickers halts too, where it turns. After a repeat it goes on, after a turn it comes back: with both
+large steps the picture must change by at least 3/4 of the larger one, and by more than 9 times the small steps (three
+even steps about a turn lead three times as far as the one in the middle, in amplitude).
+
+    pattern   A step is small if its change is at most 1/5 (almost half of the amplitude) of the second largest around
+              it: coders with few bits blend a repeat with its neighbours. A pattern is a period of 2 to 12 steps in
+              which four fifths of the steps at some places are small, half of these halts, and at most half at the
+              other places are small, in one shot.
+    single    A halt is a repeat if its change is at most 1/12 of that of each of the four steps before and after,
               unless the step before it is large: a coder with few bits repeats its keyframes, which look unlike the
               frames before them.
-    elsewhere A step is a repeat if its change is at most 1/6 of the median before it and of that after it, and either
-              at most 1/25 of the largest on either side, or the next step makes up for it. Where motion comes to rest
-              or begins, only one side is that large.
+    several   Where they are 3 % of the steps, and four, halts are repeats if their change is at most 1/6 of the median
+              before and of that after.
 """
 
 from __future__ import annotations
@@ -42,9 +46,9 @@ from v2v_server.corpus.scenes.scene import LAG_FRAMES, NO_BARS, PIECE, SEGMENT_F
 Spans = tuple[tuple[int, int], ...]
 """(first frame, frame after the last) of each stretch."""
 
-_RATIO = 25
 _MEDIAN_RATIO = 6
-_PATTERN_RATIO = 5
+_HALT_RATIO = 5
+_TURN_RATIO = 9
 _REACH = 4
 _CUT_REACH = 8
 _SURE_RATIO = 12
@@ -104,11 +108,36 @@ def change_of(before: npt.NDArray[np.int64], after: npt.NDArray[np.int64]) -> in
     return int(np.square(difference, where=np.abs(difference) > _NOISE, out=np.zeros_like(difference)).sum())
 
 
-def duplicated(changes: Sequence[int], blocks: int, boundaries: Sequence[int] = ()) -> npt.NDArray[np.bool_]:
+def halt_before(blocks: Sequence[npt.NDArray[np.int64]], changes: Sequence[int], pixels: Sequence[int]) -> int:
+    """Return the number of steps before the last one in which the picture halts; 0 if it moves, or comes back.
+
+    Args:
+        blocks: [n][rows, columns], means of the blocks of the last pictures, 1/64 grey level.
+        changes: at least n - 1, those of the steps up to the last picture, (1/64 grey level)^2.
+        pixels: at least n - 1, sums of the squared changes of all pixels in these steps, grey level^2.
+    """
+    for count in range(1, len(blocks) - 2):
+        if _are_small(changes, count, _LEAST_CHANGE * blocks[-1].size):
+            before, first, last, after = (blocks[at] for at in (-3 - count, -2 - count, -2, -1))
+            way, step = change_of(before, after), max(change_of(before, last), change_of(first, after))
+            goes_on = 4 * way > 3 * step and way > _TURN_RATIO * change_of(first, last)
+            return count if goes_on and _are_small(pixels, count, 0) else 0
+    return 0
+
+
+def _are_small(changes: Sequence[int], count: int, least: int) -> bool:
+    """Return whether the steps before the last one change little beside the two around them."""
+    return min(changes[-2 - count], changes[-1]) >= max(least, _HALT_RATIO * max(changes[-1 - count : -1]))
+
+
+def duplicated(
+    changes: Sequence[int], halts: npt.NDArray[np.bool_], blocks: int, boundaries: Sequence[int] = ()
+) -> npt.NDArray[np.bool_]:
     """Return which steps repeat a frame.
 
     Args:
         changes: [N] sums of squares, (1/64 grey level)^2.
+        halts: [N], whether :func:`halt_before` counts the step.
         blocks: number of blocks in each sum.
         boundaries: frames at which another shot begins.
 
@@ -119,17 +148,15 @@ def duplicated(changes: Sequence[int], blocks: int, boundaries: Sequence[int] = 
     flags, others = np.zeros(len(each), bool), np.zeros(len(each), bool)
     for first, end in pairwise([0, *boundaries, len(each) + 1]):
         shot = slice(first, end - 1)  # the steps between its frames
-        pattern = _in_pattern(each[shot], least)
+        steps, pattern = changes[shot], _in_pattern(each[shot], halts[shot], least)
         flags[shot] = pattern
-        if not pattern.any():
-            others[shot] = [_is_repeat(changes[shot], at, least) for at in range(end - 1 - first)]
-        sure = [_is_surely_repeat(changes[shot], at, least) for at in range(end - 1 - first)]
-        flags[shot] |= np.array(sure, bool)
-    count = int(others.sum())
-    return flags | others if count >= _LEAST_COUNT and 1000 * count >= _LEAST_PER_MILLE * len(each) else flags
+        for at in np.flatnonzero(halts[shot]).tolist():
+            flags[first + at] |= _is_surely_repeat(steps, at, least)
+            others[first + at] = not pattern.any() and _is_repeat(steps, at, least)
+    return flags | others if others.sum() >= max(_LEAST_COUNT, _LEAST_PER_MILLE * len(each) / 1000) else flags
 
 
-def _in_pattern(changes: npt.NDArray[np.int64], least: int) -> npt.NDArray[np.bool_]:
+def _in_pattern(changes: npt.NDArray[np.int64], halts: npt.NDArray[np.bool_], least: int) -> npt.NDArray[np.bool_]:
     """Return which steps of a shot repeat a frame in a regular pattern."""
     count, none = len(changes), np.zeros(len(changes), bool)
     if not count:
@@ -137,37 +164,28 @@ def _in_pattern(changes: npt.NDArray[np.int64], least: int) -> npt.NDArray[np.bo
     around = np.lib.stride_tricks.sliding_window_view(np.pad(changes, _REACH), 2 * _REACH + 1)
     largest = np.partition(around, -2, axis=1)[:, -2]
     moves = largest >= least
-    small = moves & (_PATTERN_RATIO * changes <= largest)
+    small = moves & (_HALT_RATIO * changes <= largest)
     for period in range(2, min(_LONGEST_PERIOD, int(moves.sum()) // 4) + 1):
-        shares = [(int(small[place::period].sum()), int(moves[place::period].sum())) for place in range(period)]
-        repeats = [5 * found >= 4 * steps > 0 for found, steps in shares]
-        others = [2 * found <= steps for found, steps in shares]
-        enough = sum(found for (found, _), repeat in zip(shares, repeats, strict=True) if repeat) >= _LEAST_COUNT
-        if enough and any(others) and all(one or other for one, other in zip(repeats, others, strict=True)):
+        places = [[each[at::period].sum() for each in (small, small & halts, moves)] for at in range(period)]
+        found, halted, steps = np.array(places).T
+        repeats, others = (5 * found >= 4 * steps) & (steps > 0) & (2 * halted >= found), 2 * found <= steps
+        if found[repeats].sum() >= _LEAST_COUNT and others.any() and (repeats | others).all():
             pattern: npt.NDArray[np.bool_] = moves & np.resize(repeats, count)
             return pattern
     return none
 
 
 def _is_repeat(changes: Sequence[int], at: int, least: int) -> bool:
-    """Return whether a step of a shot repeats a frame outside of any pattern."""
-    before, after = changes[max(0, at - _REACH) : at], changes[at + 1 : at + 1 + _REACH]
-    sides = sorted(before), sorted(after)
-    if not all(sides):
-        return False
-    largest, median = min(side[-1] for side in sides), min(side[len(side) // 2] for side in sides)
-    if largest < least or _MEDIAN_RATIO * changes[at] > median:
-        return False
-    around = sorted([*before, *after])
-    return _RATIO * changes[at] <= largest or 2 * after[0] >= 3 * around[len(around) // 2]
+    """Return whether a halt of a shot repeats a frame if others do, outside of any pattern."""
+    sides = sorted(changes[max(0, at - _REACH) : at]), sorted(changes[at + 1 : at + 1 + _REACH])
+    return all(side and side[len(side) // 2] >= max(least, _MEDIAN_RATIO * changes[at]) for side in sides)
 
 
 def _is_surely_repeat(changes: Sequence[int], at: int, least: int) -> bool:
-    """Return whether a step of a shot repeats a frame, by itself."""
+    """Return whether a halt of a shot repeats a frame, by itself."""
     around = sorted([*changes[max(0, at - _REACH) : at], *changes[at + 1 : at + 1 + _REACH]])
-    if len(around) < 2 * _REACH or around[0] < max(2 * least, _SURE_RATIO * changes[at]):
-        return False
-    return changes[at - 1] <= 3 * around[_REACH]
+    stands_out = len(around) == 2 * _REACH and around[0] >= max(2 * least, _SURE_RATIO * changes[at])
+    return stands_out and changes[at - 1] <= 3 * around[_REACH]
 
 
 def is_cut(changes: Sequence[int], step: int) -> bool:

@@ -1,10 +1,5 @@
 """Videos in object storage, each fetched once to a folder of this host.
 
-A copy is named by a hash of address, id and fingerprint, so a changed object gets another name, and the content of a
-name is what was catalogued. Any number of processes share a folder. The process that fetches a video holds a lock that
-the others wait for, writes under another name, and renames. A reader holds a shared lock on its copy, which eviction
-respects. If space runs out, the least recently read copies are evicted.
-
 Each store has exceptions of its own. Here they become the three of every source: gone, denied, and everything else,
 which may pass.
 """
@@ -13,22 +8,26 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import hashlib
 import os
 import posixpath
 import random
 import re
 import time
+import zlib
 from array import array
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from functools import cached_property
 from importlib import import_module
+from io import BytesIO
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
-from typing import IO, Any, TypeVar
+from tempfile import TemporaryDirectory
+from typing import Any, TypeVar
 from zipfile import Path as ZipPath
 from zipfile import ZipFile
 
@@ -38,29 +37,45 @@ from v2v_protocol.errors import (
     UsageError,
     VideoChanged,
     VideoDenied,
+    VideoError,
     VideoGone,
     VideoUnreadable,
 )
-from v2v_protocol.programs import printable
+from v2v_protocol.programs import install_line, printable
+from v2v_server.corpus.sources.archives import (
+    MOST_DIRECTORY_BYTES,
+    MOST_ZIP_HEAD_BYTES,
+    ZIP_END_BYTES,
+    ZIP_HEAD_BYTES,
+    MemberPath,
+    directory_bytes,
+    find_archive,
+    is_deflated,
+    name_in,
+    same_ids,
+    zip_head_rest,
+)
+from v2v_server.corpus.sources.copy_folder import CopyFolder
+from v2v_server.corpus.sources.listing import ListEntry, answers, count_left_out
+from v2v_server.corpus.sources.object_parts import PART_BYTES, ReadBytes, copy_bytes, inflate, open_part
+from v2v_server.corpus.sources.sidecars import is_sidecar, sidecar_fingerprint, state_of_parts, state_text
 from v2v_server.corpus.sources.source import (
     GONE,
     MANIFEST_NAME,
     NO_STATE,
     UNPRINTABLE,
     FileState,
-    ListEntry,
+    MemberPlace,
     SourceOptions,
     VideoSource,
-    answers,
-    count_left_out,
-    is_sidecar,
-    sidecar_fingerprint,
-    state_text,
+    is_expected,
+    mark_of,
+    unmarked,
 )
-from v2v_server.store.pixels import PIXEL_KINDS, VideosKind, kind_of, open_pixels
-from v2v_server.store.quota import MOST_GIB, PARTIAL, QuotaFolder
+from v2v_server.kinds.registry import KINDS, kind_of
+from v2v_server.store.quota import MOST_GIB
 from v2v_server.store.verified import content_of
-from v2v_server.system.process import cache_folder, locked, make_private
+from v2v_server.system.process import cache_folder
 from v2v_server.video.fingerprint import TIMES_ABOVE, check_content, is_same_file
 from v2v_server.video.fingerprint import fingerprint as video_fingerprint
 
@@ -113,9 +128,9 @@ class Bucket:
             store = import_module("fsspec").filesystem(kind, **_OPTIONS.get(kind, {}))
         except ImportError as error:
             raise UsageError(
-                f"--videos {self.url}: {error}; the extra 'cloud' brings fsspec and s3fs: pip install "
-                "'.[server,cloud]' in a checkout of v2v-stream. Other stores need a package more: gcsfs for gs://, "
-                "huggingface_hub for hf://"
+                f"--videos {self.url}: {error}; the extra 'cloud' brings fsspec and s3fs: "
+                f"{install_line('server,cloud')}. Other stores need a package more: gcsfs for gs://, huggingface_hub "
+                "for hf://"
             ) from error
         except ValueError as error:
             raise UsageError(f"--videos {self.url}: {error}") from error
@@ -171,13 +186,16 @@ class Bucket:
             raise VideoGone(below, None, f"is not in {self.url} any more")
         return states
 
-    def state(self, id: str, tries: int = TRIES) -> FileState:
+    def state(self, id: str, tries: int = TRIES, member: str = "") -> FileState:
         """Ask for the state of one object: its size, and 63 bits that stand for its ETag or the store's equivalent.
+
+        Args:
+            member: of the object, if it is an archive: what errors name.
 
         Raises:
             VideoGone, VideoDenied, VideoUnreadable: the store does not deliver it.
         """
-        return self._ask(id, lambda: _state(self._store.info(self._path(id))), tries)
+        return self._ask(member or id, lambda: _state(self._store.info(self._path(id))), tries)
 
     def fetch(self, id: str, to: Path) -> None:
         """Write an object to a file.
@@ -186,6 +204,42 @@ class Bucket:
             VideoGone, VideoDenied, VideoUnreadable: the store does not deliver it.
         """
         self._ask(id, lambda: self._store.get_file(self._path(id), str(to)))
+
+    def read(
+        self,
+        id: str,
+        part: tuple[int, int],
+        is_same: Callable[[FileState], bool],
+        use: Callable[[ReadBytes], T],
+        tries: int = TRIES,
+        member: str = "",
+    ) -> T:
+        """Pass a part of an object on, and return what is made of it. All bytes are of the same state.
+
+        Args:
+            part: its first byte, and the byte behind the last; that is 0 for the end of the object.
+            is_same: returns whether a state is the catalogued one.
+            use: reads the bytes. It is called once more if a try fails.
+            member: see :meth:`state`.
+
+        Raises:
+            VideoGone, VideoDenied, VideoUnreadable: the store does not deliver it.
+            VideoChanged: it is another object by now.
+        """
+
+        def check(state: FileState) -> None:
+            if not is_same(state):
+                raise VideoChanged(member or id, None, f"changed in {self.url} since it was catalogued: {id} differs")
+
+        def question() -> T:
+            with open_part(self._store, self._path(id), *part) as (read, told):
+                check(self.state(id, tries, member) if told is None else _state(told))
+                used = use(read)
+                if told is None:
+                    check(self.state(id, tries, member))
+                return used
+
+        return self._ask(member or id, question, tries)
 
     def _path(self, id: str) -> str:
         if PurePosixPath(id).is_absolute() or ".." in PurePosixPath(id).parts:
@@ -198,7 +252,7 @@ class Bucket:
         for left in reversed(range(tries)):
             try:
                 return question()
-            except ProtocolError:
+            except (ProtocolError, VideoError):
                 raise
             except Exception as error:
                 # fsspec reports any failure over HTTP as a missing file; its cause is an answer's status or an OSError.
@@ -219,7 +273,7 @@ class Bucket:
         raise AssertionError
 
 
-def _state(info: dict[str, Any]) -> FileState:
+def _state(info: Mapping[str, Any]) -> FileState:
     mark, size = next((str(info[key]) for key in _MARKS if info.get(key) is not None), ""), info.get("size")
     if size is None:  # answered in chunks: without a mark either, nothing tells a change
         size = 0 if mark else NO_STATE[0]
@@ -228,15 +282,6 @@ def _state(info: dict[str, Any]) -> FileState:
 
 _ZIP_EPOCH = 315_619_200
 """A time that archives can state, 1980-01-02, in seconds since 1970."""
-_SLOTS = 64
-"""Videos that a host can fetch at a time, and so the most unfinished files that killed processes leave behind."""
-_LOCK_SECONDS = 30.0
-"""Longest wait for another process that evicts copies. No lease has begun yet, so no video is blamed for it."""
-_SLOT_SECONDS = 20.0
-"""Longest wait for another process that fetches a video of the same slot. Then the next free slot is used: the process
-may be stopped, and fetching one video twice costs less than a waiting worker."""
-_ROOM_SECONDS = 2.0
-"""Wait before the next try if all copies are being read."""
 
 
 class Copies(VideoSource):
@@ -244,8 +289,7 @@ class Copies(VideoSource):
 
     Args:
         bucket: where the videos come from.
-        copies: folder of the copies; other corpora may share it.
-        most_bytes: limit of the folder.
+        copies, most_bytes: see :class:`CopyFolder`.
         listed: reads the videos to take from the address; None takes all.
     """
 
@@ -259,14 +303,8 @@ class Copies(VideoSource):
         listed: Callable[[], tuple[ListEntry, ...] | None] = lambda: None,
     ) -> None:
         super().__init__(bucket.url, listed)
-        self.bucket, self.copies, self.most_bytes = bucket, copies, most_bytes
-        self._quota = QuotaFolder(copies, most_bytes, _LOCK_SECONDS)
-        self._at_hand: dict[tuple[str, str], IO[bytes]] = {}
-
-    @property
-    def copies_options(self) -> tuple[Path, float]:
-        """Return the folder of copies and its limit, see :attr:`VideoSource.copies_options`."""
-        return self.copies, self.most_bytes / (1 << 30)
+        self.bucket = bucket
+        self.copies: CopyFolder = CopyFolder(bucket.url, copies, most_bytes, self._write)
 
     @cached_property
     def _objects(self) -> dict[str, FileState]:
@@ -290,14 +328,16 @@ class Copies(VideoSource):
         for name in self._objects:
             if name.rpartition("/")[2] == MANIFEST_NAME:
                 raise CorpusError(f"{self}: {name} makes it a prepared corpus: copy that to a disk")
-        if self.listed is not None:
-            yield from (entry.id for entry in self.listed)
+        if (listed := self.listed()) is not None:
+            yield from (
+                entry.id if entry.id in self._objects else self.archive_of(entry.id) or entry.id for entry in listed
+            )
             return
         for name in self._objects:
             parts = name.split("/")
             if any(part.startswith(".") for part in parts):
                 continue
-            if not (id := self.kind.form.id_of(name)) and self.kind.form.id_of(name.partition("?")[0]):
+            if not (id := self.kind.entry_of(name)) and self.kind.entry_of(name.partition("?")[0]):
                 refused[printable(name)] = "is a link with a query, which is not followed: link to the file itself"
             elif not id:
                 count_left_out(parts[-1], left_out)
@@ -305,19 +345,20 @@ class Copies(VideoSource):
                 refused[printable(name)] = UNPRINTABLE
             elif "" in parts or id == "/":
                 refused[name] = "has an empty part between two slashes, or is a picture outside of a folder"
+            elif why := same_ids(name, self.kind.archive_endings, self._is_there):
+                refused[name] = why
             else:
                 yield id
 
-    def make(self) -> None:
-        """Create the folder of copies.
+    def archive_of(self, id: str) -> str:
+        """Return the listed archive that the id of a member leads into; "" if it leads into none."""
+        return find_archive(id, self.kind.archive_endings, self._is_folder, self._objects.__contains__)
 
-        Raises:
-            CorpusError: it cannot be created or written to.
-        """
-        try:
-            self._quota.make()
-        except OSError as error:
-            raise CorpusError(f"--copies {self.copies}: cannot be written to: {error.strerror or error}") from error
+    def _is_folder(self, path: str) -> bool:
+        return next(self._below(f"{path}/"), None) is not None
+
+    def _is_there(self, path: str) -> bool:
+        return path in self._objects or self._is_folder(path)
 
     def states(self, ids: Sequence[str]) -> array[int]:
         """Return the states of many objects, from the listing."""
@@ -332,10 +373,12 @@ class Copies(VideoSource):
         Raises:
             VideoUnreadable: the store does not answer, or has no such object.
         """
+        if member := self._member(id):  # what delivers its bytes checks the archive
+            return unmarked(self, id, member.state)
         if id.endswith("/"):
-            return self.state_of_parts(id, self._parts(id, listed, tries))
+            return state_of_parts(self, id, self._parts(id, listed, tries))
         size, content, _ = self.bucket.state(id, tries) if listed is None else listed.get(id, GONE)
-        return size, content, self.mark(id)
+        return size, content, mark_of(self, id)
 
     def _parts(
         self, id: str, listed: Mapping[str, FileState] | None = None, tries: int = TRIES
@@ -364,6 +407,10 @@ class Copies(VideoSource):
             if is_sidecar(id):
                 found = self.bucket.find(id, tries=1) if id.endswith("/") else {"": self.bucket.state(id, tries=1)}
                 changed = state_text(sorted(found.items())) != state and state is not None
+            elif member := self._member(id, unmarked(self, id, state) if isinstance(state, tuple) else ()):
+                changed = not member.is_in(self.bucket.state(member.archive, tries=1, member=id))
+            elif state is None and self.archive_of(id):
+                return  # in which state it was is not known
             else:
                 changed = self.state(id, tries=1) != state and state is not None
         except VideoGone:
@@ -378,6 +425,10 @@ class Copies(VideoSource):
     def sidecar_state(self, id: str) -> str | OSError:
         """Return a text that stands for the listed objects' states, see :meth:`VideoSource.sidecar_state`."""
         try:
+            if self.tables and (table := self.tables.get(archive := self.archive_of(id))):
+                member = MemberPath(archive, 0, name_in(archive, id), table)  # type: ignore[abstract]
+                if member.is_dir() if id.endswith("/") else member.is_file():
+                    raise OSError(errno.ENOTSUP, "lies in an archive of object storage, where none is read: unpack it")
             return state_text((name[len(id) :], self._objects[name]) for name in self._below(id))
         except OSError as error:
             return error
@@ -391,137 +442,131 @@ class Copies(VideoSource):
             yield id
 
     def has(self, files: Mapping[str, str]) -> bool:
-        """Return whether the copies are there. If so, they stay until others are asked for, or fetched."""
-        if self._at_hand.keys() == files.items():
-            return True
-        held: dict[tuple[str, str], IO[bytes]] = {}
-        for id, fingerprint in files.items():
-            copy = self._hold(self._path(id, fingerprint))
-            if copy is None:
-                _close(held)
-                return False
-            held[id, fingerprint] = copy
-        self.release()
-        self._at_hand = held
-        return True
+        """Return whether the copies are there, see :meth:`CopyFolder.has`."""
+        return self.copies.has(files)
 
     def fetch(self, files: Mapping[str, str]) -> None:
-        """Fetch the copies that are missing; afterwards :meth:`has` returns True.
+        """Fetch the copies that are missing, see :meth:`CopyFolder.fetch`."""
+        self.copies.fetch(files)
+
+    def open_local(self, id: str, fingerprint: str) -> AbstractContextManager[Path]:
+        """Lend the copy of a video, see :meth:`CopyFolder.lend`."""
+        return self.copies.lend(id, fingerprint)
+
+    def _write(self, id: str, fingerprint: str, slot: Path) -> str:
+        """Fetch a file, and return its fingerprint.
 
         Raises:
-            VideoUnreadable: one cannot be fetched.
-            VideoChanged: an object is another one by now.
+            VideoUnreadable: the store does not deliver it.
+            VideoChanged: it is another one by now.
         """
-        self.release()
-        for id, fingerprint in files.items():
-            self._at_hand[id, fingerprint] = self._get(id, fingerprint)
-
-    @contextlib.contextmanager
-    def open_local(self, id: str, fingerprint: str) -> Iterator[Path]:
-        """Lend the copy of a video until the end of the context.
-
-        Args:
-            fingerprint: of the video as catalogued; "" fetches what is there now.
-
-        Raises:
-            VideoUnreadable, VideoChanged: see :meth:`fetch`.
-        """
-        if (id, fingerprint) in self._at_hand:
-            yield self._path(id, fingerprint)
-            return
-        held = self._hold(self._path(id, fingerprint)) if fingerprint else None
-        if held is None:
-            self.release()
-            held = self._get(id, fingerprint)
-        with held:
-            yield Path(held.name)
-
-    def keep_as(self, id: str, found: str, fingerprint: str) -> None:
-        """See :meth:`VideoSource.keep_as`."""
-        # A link, because another process may be reading the copy under its first name, which then stays.
-        with contextlib.suppress(OSError), self._locked_slot(_slot_number(id)) as slot:
-            slot.unlink(missing_ok=True)
-            try:
-                slot.hardlink_to(self._path(id, found))
-                self._quota.remove(self._path(id, found))
-                self._quota.add(slot, self._path(id, fingerprint), evicts=True)
-            finally:
-                slot.unlink(missing_ok=True)
-
-    def release(self) -> None:
-        """Allow eviction of the copies that :meth:`has` or :meth:`fetch` keeps."""
-        _close(self._at_hand)
-        self._at_hand = {}
-
-    def _path(self, id: str, fingerprint: str) -> Path:
-        # All of the fingerprint: the copy of an object that changed in the middle only has another name.
-        key = hashlib.sha256(repr((self.bucket.url, id, fingerprint)).encode()).hexdigest()[:32]
-        return self.copies / key[:2] / f"{key}{PurePosixPath(id).suffix}"
-
-    def _hold(self, path: Path) -> IO[bytes] | None:
-        """Return the open copy, locked against eviction; None if it is not there."""
-        with contextlib.ExitStack() as undo, contextlib.suppress(OSError):  # evicted, before or just now
-            file = undo.enter_context(path.open("rb"))
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # a copy that another process locks is fetched again
-            if os.path.samestat(os.fstat(file.fileno()), path.stat()):
-                os.utime(path)
-                undo.pop_all()
-                return file
-        return None
-
-    def _get(self, id: str, fingerprint: str) -> IO[bytes]:
-        """Fetch a video, and return its copy, locked against eviction."""
-        try:
-            with self._locked_slot(_slot_number(id)) as slot:
-                held = self._hold(self._path(id, fingerprint)) if fingerprint else None  # another process was faster
-                return held or self._fetch(id, fingerprint, slot)
-        except OSError as error:
-            why = f"cannot be copied to {self.copies}: {error.strerror or error}"
-            raise VideoUnreadable(id, None, why) from error
-
-    @contextlib.contextmanager
-    def _locked_slot(self, number: int) -> Iterator[Path]:
-        """Lend a file to fetch into: the one of this number, or the next one if another process holds it.
-
-        Raises:
-            OSError: other processes hold all of them.
-        """
-        end, held = time.monotonic() + _SLOT_SECONDS, contextlib.ExitStack()
-        for other in range(_SLOTS):
-            slot = self.copies / PARTIAL / f"{(number + other) % _SLOTS:02}"
-            with contextlib.suppress(BlockingIOError):
-                held.enter_context(locked(slot.with_suffix(".lock"), end - time.monotonic()))
-                break
+        expected = is_expected(self, id)
+        if member := self._member(id):
+            self._write_member(id, member, slot)
+        elif id.endswith("/"):
+            self._pack(id, slot)
         else:
-            raise BlockingIOError(errno.EAGAIN, f"other processes keep all {_SLOTS} of its slots; end them")
-        with held:
-            yield slot
+            self.bucket.fetch(id, slot)
+        slot.chmod(0o600)  # where the store's own tools put another file there
+        found = self._fingerprint(id, slot)
+        if fingerprint and not is_same_file(found, fingerprint):
+            why = f"changed in {self} since it was catalogued: {found} instead of {fingerprint}"
+            raise VideoChanged(id, None, why)
+        if id == self.expected[0] and not (expected and is_expected(self, id)):
+            self._check_content(id, slot, fingerprint)
+        return found
 
-    def _fetch(self, id: str, fingerprint: str, slot: Path) -> IO[bytes]:
-        try:
-            make_private(slot)
-            is_expected = self._is_expected(id)
-            if id.endswith("/"):
-                self._pack(id, slot)
-            else:
-                self.bucket.fetch(id, slot)
-            slot.chmod(0o600)  # where the store's own tools put another file there
-            found = self._fingerprint(id, slot)
-            if fingerprint and not is_same_file(found, fingerprint):
-                why = f"changed in {self} since it was catalogued: {found} instead of {fingerprint}"
-                raise VideoChanged(id, None, why)
-            if id == self._expected[0] and not (is_expected and self._is_expected(id)):
-                self._check_content(id, slot, fingerprint)
-            path = self._path(id, fingerprint or found)
-            with slot.open("rb") as file:
-                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # the lock outlives renaming: no eviction in between
-                self._place(id, slot, path)
-                held = self._hold(path)
-            if held is None:
-                raise OSError("its copy was removed at once")
-            return held
-        finally:
-            slot.unlink(missing_ok=True)
+    def _write_member(self, id: str, member: MemberPlace, slot: Path) -> None:
+        """Fetch a member of an archive with one question.
+
+        Raises:
+            VideoError: see :meth:`Bucket.read`; or it is damaged in the archive.
+            VideoUnreadable: it is larger than all copies may be. Few deflated bytes can stand for a full disk.
+        """
+        if member.size > self.copies.most_bytes:
+            raise VideoUnreadable(id, None, f"its {member.size} bytes exceed the limit of copies: raise --copies-gib")
+        is_zip = member.archive.endswith(".zip")
+
+        def use(read: ReadBytes) -> None:
+            with slot.open("wb") as file:
+                if is_zip:
+                    copy_bytes(read, head := BytesIO(), ZIP_HEAD_BYTES)
+                    if (rest := zip_head_rest(head.getvalue(), -1)) < 0:
+                        raise VideoError(
+                            id, None, f"its header in {member.archive} is damaged: upload the archive again"
+                        )
+                    copy_bytes(read, BytesIO(), rest)
+                if is_zip and is_deflated(head.getvalue()):
+                    try:
+                        inflate(read, file, member.size)
+                    except (zlib.error, ValueError) as error:
+                        raise VideoError(
+                            id, None, f"cannot be inflated ({error}): upload {member.archive} again"
+                        ) from error
+                else:
+                    copy_bytes(read, file, member.size)
+
+        # One byte at least: there is no range of none. Deflated bytes may be a few more than those that they stand for.
+        more = MOST_ZIP_HEAD_BYTES + member.size // 1000 if is_zip else 0
+        part = member.start, member.start + more + max(member.size, 1)
+        self.bucket.read(member.archive, part, member.is_in, use, member=id)
+
+    @contextlib.contextmanager
+    def lend_archive(self, archive: str, state: FileState) -> Iterator[str]:
+        """Lend a pipe with the bytes of a tar file, or a file that has the directory of a zip file in its place, and
+        nothing else of it; see :meth:`HasArchives.lend_archive`.
+        """
+        if state[0] <= 0:
+            raise VideoUnreadable(archive, None, "is empty, or its store does not say how large it is")
+        with TemporaryDirectory(prefix="v2v-archive-") as folder:
+            path = Path(folder, "archive")
+            if archive.endswith(".zip"):
+                self._write_directory(archive, state, path)
+                yield str(path)
+                return
+            os.mkfifo(path)
+            ours = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # without a reader, a writer could not open it
+            with ThreadPoolExecutor(1) as thread:
+                fed = thread.submit(self._feed, archive, state, os.open(path, os.O_WRONLY))
+                try:
+                    yield str(path)
+                finally:
+                    os.close(ours)  # of a process that did not read to the end: then writing ends, too
+                fed.result()
+
+    def _feed(self, archive: str, state: FileState, pipe: int) -> None:
+        def use(read: ReadBytes) -> None:
+            with contextlib.suppress(BrokenPipeError):
+                while block := read(PART_BYTES):
+                    to.write(block)
+
+        with open(pipe, "wb", buffering=0) as to:
+            self.bucket.read(archive, (0, 0), state.__eq__, use, tries=1)  # the pipe has what was written to it
+
+    def _write_directory(self, archive: str, state: FileState, path: Path) -> None:
+        """Write the end of a zip file with its directory, and nothing in front of it.
+
+        Raises:
+            VideoError: see :meth:`Bucket.read`; or the directory is too large.
+        """
+
+        def last(count: int) -> bytes:
+            count = min(count, state[0])
+
+            def use(read: ReadBytes) -> bytes:
+                copy_bytes(read, end := BytesIO(), count)
+                return end.getvalue()
+
+            return self.bucket.read(archive, (state[0] - count, state[0]), state.__eq__, use)
+
+        end = last(ZIP_END_BYTES)
+        if (needed := directory_bytes(end)) > MOST_DIRECTORY_BYTES:
+            why = f"has a directory of {needed} bytes; the limit is {MOST_DIRECTORY_BYTES}: split it"
+            raise VideoUnreadable(archive, None, why)
+        end = last(needed) if needed > len(end) else end
+        with path.open("wb") as file:
+            file.seek(state[0] - len(end))
+            file.write(end)
 
     def _pack(self, id: str, slot: Path) -> None:
         """Fetch a folder into one file, a ZIP archive without compression."""
@@ -555,25 +600,10 @@ class Copies(VideoSource):
         named.unlink(missing_ok=True)
         named.symlink_to(slot.name)
         try:
-            with open_pixels(named, kind_of(id)) as pixels:
+            with kind_of(id).open_pixels(named) as pixels:
                 check_content(named, content_of(pixels), fingerprint)
         finally:
             named.unlink()
-
-    def _place(self, id: str, slot: Path, path: Path) -> None:
-        """Give the fetched file its name. If space runs out, evict copies without a reader, least recently read first.
-
-        Raises:
-            VideoUnreadable: the copies that are being read leave too little space.
-        """
-        for wait in (_ROOM_SECONDS, _ROOM_SECONDS, 0.0):
-            if self._quota.add(slot, path, evicts=True):
-                return
-            time.sleep(wait)
-        why = (
-            f"its {slot.stat().st_size} bytes do not fit beside the {self._quota.used_bytes} bytes that are being read"
-        )
-        raise VideoUnreadable(id, None, f"{why}: raise --copies-gib")
 
 
 def open_source(name: str, options: SourceOptions) -> Copies | None:
@@ -588,15 +618,6 @@ def open_source(name: str, options: SourceOptions) -> Copies | None:
         raise UsageError(f"--copies-gib {options.copies_gib:g}: give more than 0, at most {MOST_GIB:g}")
     folder = Path(options.copies or cache_folder(options.cache_dir) / "copies").absolute()
     bucket, listed, (above, _, file) = Bucket(name), options.listed, name.rpartition("/")
-    if options.list_file is None and any(VideosKind(kind).form.id_of(file) == file != "" for kind in PIXEL_KINDS):
+    if options.list_file is None and any(kind.entry_of(file) == file != "" for kind in KINDS.values()):
         bucket, listed = Bucket(above, file), lambda: (ListEntry(file),)
     return Copies(bucket, folder, int(options.copies_gib * (1 << 30)), listed)
-
-
-def _slot_number(id: str) -> int:
-    return int(hashlib.sha256(id.encode()).hexdigest(), 16)
-
-
-def _close(held: Mapping[tuple[str, str], IO[bytes]]) -> None:
-    for file in held.values():
-        file.close()

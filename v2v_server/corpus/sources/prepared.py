@@ -26,10 +26,9 @@ from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
 from v2v_protocol.persisted import Limits, Persisted, later, parse_json
 from v2v_protocol.programs import printable
 from v2v_protocol.write_aside import write_aside_and_rename
-from v2v_server.corpus.index import IndexRow
 from v2v_server.corpus.scenes.scene import Scene
 from v2v_server.corpus.sources.folder import Folder, locate
-from v2v_server.corpus.sources.source import MANIFEST_NAME, UNPRINTABLE, SourceOptions
+from v2v_server.corpus.sources.source import MANIFEST_NAME, UNPRINTABLE, SourceOptions, VideoSource
 from v2v_server.store.format import SIZES
 from v2v_server.video.frame_index import LARGEST_FRAMES, LARGEST_INDEXED_SIDE_PX
 from v2v_server.video.rows import Rows
@@ -119,27 +118,6 @@ class Manifest:
 
     header: Header
     videos: dict[str, PreparedVideo]
-
-    def as_source(self, record: IndexRow) -> IndexRow:
-        """Return the record of a prepared file with the facts that have to agree with its source.
-
-        This includes videos without a usable file, whose codec is ABSENT: the sequences of the others keep their places
-        only if the source's frames are counted. A usable file may be damaged: each of its blocks is checked when it is
-        read. The source itself will do in its place.
-        """
-        video = self.videos[record.id]
-        is_there = record.problem is None and record.fingerprint == video.source_fingerprint
-        return replace(
-            record,
-            fingerprint=video.source_fingerprint,
-            frames=video.frames,
-            height_px=video.height_px,
-            width_px=video.width_px,
-            frames_per_second=video.frames_per_second,
-            codec=record.codec if is_there else ABSENT,
-            remark=video.remark,
-            problem=None,
-        )
 
 
 def read_manifest(root: Path) -> Manifest:
@@ -251,7 +229,7 @@ class Prepared(Folder):
     def videos(self, refused: dict[str, str], left_out: Counter[str]) -> Iterator[str]:
         """List the videos of the manifest; other files are passed over."""
         known = self.manifest.videos
-        for id in sorted(known) if self.listed is None else [entry.id for entry in self.listed]:
+        for id in sorted(known) if (listed := self.listed()) is None else [entry.id for entry in listed]:
             if id in known:
                 yield id
             else:
@@ -260,33 +238,45 @@ class Prepared(Folder):
                     "v2v-prepare was not asked for it; run it once for all of them"
                 )
 
-    def file_of(self, id: str) -> str:
+    def path_of(self, id: str) -> str:
         """Return the path of the prepared file."""
-        return prepared_name(id)
+        return f"{self.name}/{prepared_name(id)}"
 
-    def rows(self, asked: Rows | None) -> Rows:
-        """Return which rows of the pictures may be used.
 
-        A folder that stores all rows may be served with any rows, another one only with its stored rows.
+def manifest_of(source: VideoSource) -> Manifest | None:
+    """Return the manifest of a prepared folder; None for any other source. Raises: see :attr:`Prepared.manifest`."""
+    return source.manifest if isinstance(source, Prepared) else None
 
-        Raises:
-            CorpusError: the folder is not finished, or lacks requested rows.
-        """
-        header, done = self.manifest.header, len(self.manifest.videos)
-        if done != header.videos:
-            raise CorpusError(
-                f"{self}: {done} of {header.videos} videos are prepared; run v2v-prepare again to finish (what is done "
-                "is kept)"
-            )
-        kept = Rows.parse(header.rows)
-        if asked is None or asked == Rows():
-            return kept
-        if kept not in (Rows(), asked):
-            raise CorpusError(
-                f"{self}: rows {asked} asked for, but this prepared folder holds rows {header.rows} of its source "
-                "only; leave --rows out, or serve the source"
-            )
-        return asked
+
+def rows_of(source: VideoSource, asked: Rows | None) -> Rows:
+    """Return which rows of the pictures may be used.
+
+    A prepared folder that stores all rows may be served with any rows, another one only with its stored rows.
+
+    Args:
+        source: where the videos come from.
+        asked: rows that the user asks for; None: all that there are.
+
+    Raises:
+        CorpusError: the folder is not finished, or lacks requested rows.
+    """
+    if (manifest := manifest_of(source)) is None:
+        return asked or Rows()
+    header, done = manifest.header, len(manifest.videos)
+    if done != header.videos:
+        raise CorpusError(
+            f"{source}: {done} of {header.videos} videos are prepared; run v2v-prepare again to finish (what is done "
+            "is kept)"
+        )
+    kept = Rows.parse(header.rows)
+    if asked is None or asked == Rows():
+        return kept
+    if kept not in (Rows(), asked):
+        raise CorpusError(
+            f"{source}: rows {asked} asked for, but this prepared folder holds rows {header.rows} of its source "
+            "only; leave --rows out, or serve the source"
+        )
+    return asked
 
 
 def open_source(name: str, options: SourceOptions) -> Prepared | None:

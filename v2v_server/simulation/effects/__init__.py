@@ -74,6 +74,7 @@ def prepare(
     pixels: int,
     real: Real,
     thresholds: tuple[float, float],
+    first: int = 0,
 ) -> tuple[Any, ...]:
     """Return the tables of every effect for one clip, in the order of :data:`EFFECTS`.
 
@@ -85,6 +86,7 @@ def prepare(
         pixels: number of pixels of the picture.
         real: arithmetic of the pixels, float32 or float64.
         thresholds: nominal ones, positive and negative, log units.
+        first: number of the first step; above 0 for a clip that continues another one.
 
     Raises:
         UsageError: more shot events in a step than can be drawn, or noise of a band without a corner.
@@ -92,6 +94,6 @@ def prepare(
     durations, table_of_step = np.unique(step_seconds, return_inverse=True)
     clip = Clip(
         linear_light(*intensity), step_seconds, durations, table_of_step.astype(np.int64), pixels, real, key, values,
-        thresholds,
+        thresholds, first,
     )  # fmt: skip
     return tuple(effect.prepare(values.get(effect.FIELD, 0.0), clip) for effect in EFFECTS)

@@ -35,6 +35,11 @@ from v2v_server.simulation.vectors import aligned_rows, use_widest_vectors
 
 _UNIT, _WHOLE = np.float32(2.0**-24), np.float32(1)
 _FIRST_ROW = (0, *accumulate(effect.ROWS for effect in EFFECTS))
+ROWS = _FIRST_ROW[-1]
+"""Rows of a block's state that the effects need."""
+_OWN = 18 + 2 * LEGS
+_CARRIED = (0, *range(_OWN, _OWN + ROWS))
+"""Rows of a block's state that outlive a clip: the residual, and those of the effects."""
 FIXED, UNIFORM, TRIANGULAR = range(3)
 """How residuals start."""
 
@@ -51,6 +56,8 @@ class Segments(NamedTuple):
         bin: int64.
         noise_scale: real, standard deviation of the noise; empty for no noise at all.
         hot_scale: real, its part of a hot pixel's drift.
+        first: number of the first segment; above 0 for a clip that continues another one.
+        resumed: whether it starts from the state at the end of that one.
     """
 
     step: Any
@@ -60,6 +67,8 @@ class Segments(NamedTuple):
     bin: Any
     noise_scale: Any
     hot_scale: Any
+    first: Any
+    resumed: Any
 
 
 def _linked(entries: Sequence[Any], name: str, link: Any) -> Any:
@@ -115,7 +124,7 @@ _begin, _events, _end = (
 @compiled
 def _simulate(
     frames, between_frames, table, fine, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
-    tolerance, start, start_residual, drifts_first, timed, is_plain, bins, limit, made, clipped, tables,
+    tolerance, start, start_residual, drifts_first, timed, is_plain, bins, limit, made, clipped, tables, carried, kept,
     state, words, floats,
 ):  # fmt: skip
     """Run the kernel in memory of the caller, so that views of arrays need no reference counting."""
@@ -126,7 +135,7 @@ def _simulate(
     residual, change, signed, positive, negative, rises = state[0], state[1], state[2], state[3], state[4], state[5]
     falls, waited, blind, on, off, old = state[6], state[7], state[8], state[9], state[10], state[11]
     share, begun, legs, shares = state[16], state[17], state[18 : 18 + LEGS], state[18 + LEGS : 18 + 2 * LEGS]
-    levels, own = state[12:16], state[18 + 2 * LEGS :]
+    levels, own = state[12:16], state[_OWN:]
     radius_words, angle_words, normal = words[4], words[5], floats[4:]
     block = Block(
         residual, change, signed, rises, falls, waited, blind, timed, positive, negative, levels, words[:4],
@@ -156,6 +165,10 @@ def _simulate(
             residual[i] = uniform * (positive[i] + negative[i]) - negative[i] if start == UNIFORM else start_residual
             if start == TRIANGULAR:
                 residual[i] = triangular(uniform, positive[i], negative[i])
+        if segments.resumed:
+            for row in range(len(carried)):
+                for i in range(last - first):
+                    state[_CARRIED[row], i] = carried[row, first + i]
         if noisy:
             for i in range(PIXELS_A_BLOCK):
                 radius_words[i] = word(pixel_radius, first + i)
@@ -244,13 +257,16 @@ def _simulate(
                         if drifts_first:
                             for spot in range(hot, next_hot):
                                 change[hot_position[spot] - first] += hot_drift[spot] * segments.hot_scale[each]
-                        _time(each, block, old, first, last, time_folds, made, clipped)
+                        _time(each, segments.first + each, block, old, first, last, time_folds, made, clipped)
             if each == count - 1 or segments.bin[each + 1] != of_bin:
                 net = on if is_plain else signed
                 if not is_plain:
                     for i in range(PIXELS_A_BLOCK):
                         net[i] = on[i] - off[i]
                 _end(made, clipped, Counts(first, last, of_bin // bins, of_bin % bins, limit, net, on, off))
+        for row in range(len(kept)):
+            for i in range(last - first):
+                kept[row, first + i] = state[_CARRIED[row], i]
 
 
 @compiled
@@ -276,13 +292,14 @@ def _take_leg(leg, block, old):
 
 
 @compiled
-def _time(each, block, old, first, last, folds, made, clipped):
+def _time(each, number, block, old, first, last, folds, made, clipped):
     """Give every event of a segment, or of a leg of it, its time, and pass it to the representations.
 
     Crossings of one pixel come at equal distances. Events that no change of intensity caused (shot noise) come at
     random times of the segment.
 
     Args:
+        number: of the segment, for the noise.
         old: [block] real, the residual at its start.
         folds: of the noise's words for these times.
     """
@@ -305,7 +322,7 @@ def _time(each, block, old, first, last, folds, made, clipped):
                 passed, apart = block.begun[i] + block.share[i] * passed, block.share[i] * apart
                 _events(made, clipped, Train(first + i, i, each, is_rising, passed, apart, crossings))
             for k in range(crossings, events):
-                drawn = word((word(folds, first + i), np.uint32(each)), np.uint32(2 * k + is_rising))
+                drawn = word((word(folds, first + i), np.uint32(number)), np.uint32(2 * k + is_rising))
                 passed = np.float64(np.int64(drawn)) * 2.0**-32
                 _events(made, clipped, Train(first + i, i, each, is_rising, passed, 0.0, 1))
 
@@ -313,7 +330,8 @@ def _time(each, block, old, first, last, folds, made, clipped):
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def simulate_general(
     frames, between_frames, table, fine, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
-    tolerance, start, start_residual, drifts_first, timed, is_plain, bins, limit, made, clipped, tables,
+    tolerance, start, start_residual, drifts_first, timed, is_plain, bins, limit, made, clipped, tables, carried,
+    kept,
 ):  # fmt: skip
     """Simulate every pixel of a clip.
 
@@ -335,12 +353,15 @@ def simulate_general(
         made: tables of all representations; written.
         clipped: [representations] int64, to which the number of values that did not fit is added.
         tables: of all effects, ``effects.prepare``.
+        carried: [1 + ROWS, pixels] real, residuals and the effects' rows at the start, if ``segments.resumed``; without
+            effects, [1, pixels].
+        kept: the same at the end, written; of no rows if it is not wanted.
     """
-    state = aligned_rows(18 + 2 * LEGS + _FIRST_ROW[-1], PITCH, table.dtype)
+    state = aligned_rows(_OWN + ROWS, PITCH, table.dtype)
     words = aligned_rows(6, PITCH, np.uint32)
     floats = aligned_rows(6, PITCH, np.float32)
     _simulate(
         frames, between_frames, table, fine, key, segments, hot_position, hot_drift, threshold_pos, threshold_neg,
         tolerance, start, start_residual, drifts_first, timed, is_plain, bins, limit, made, clipped, tables,
-        state, words, floats,
+        carried, kept, state, words, floats,
     )  # fmt: skip

@@ -57,12 +57,14 @@ class Tables(NamedTuple):
         law_of_step: [steps] int64.
         sigma: real, log units.
         words: [3, block] uint32 of the pixels: radius, angle, extremes.
+        first: int64, number of the first step.
     """
 
     laws: Any
     law_of_step: Any
     sigma: Any
     words: Any
+    first: Any
 
 
 def prepare(value: float, clip: Clip) -> Tables:
@@ -77,7 +79,7 @@ def prepare(value: float, clip: Clip) -> Tables:
     sigma = value * sum(clip.thresholds) / 2.0
     laws = laws_of(2.0 * np.pi * corner * clip.durations, sigma) if value > 0.0 else np.empty((0, 6))
     words = np.empty((3, PIXELS_A_BLOCK), np.uint32)
-    return Tables(laws.astype(clip.real), clip.table_of_step, clip.real(sigma), words)
+    return Tables(laws.astype(clip.real), clip.table_of_step, clip.real(sigma), words, np.int64(clip.first))
 
 
 def laws_of(steps: Doubles, sigma: float) -> Doubles:
@@ -106,7 +108,7 @@ def start(tables, own, block, at):
             tables.words[0, i] = word(radius, at.first + i)
             tables.words[1, i] = word(angle, at.first + i)
             tables.words[2, i] = word(extremes, at.first + i)
-        _draw(tables.words, block, 0)
+        _draw(tables.words, block, tables.first // 2)
         for i in range(PIXELS_A_BLOCK):
             own[0, i], own[1, i] = block.floats[0, i] * tables.sigma, block.floats[1, i]
 
@@ -115,12 +117,12 @@ def start(tables, own, block, at):
 def divide(tables, own, block, at):
     """Divide the step into its three legs."""
     if len(tables.laws) > 0:
-        law, number = tables.laws[tables.law_of_step[at.step]], at.step + 1
+        law, number = tables.laws[tables.law_of_step[at.step]], tables.first + at.step + 1
         if number % 2 == 0:
             _draw(tables.words, block, number // 2)
             for i in range(PIXELS_A_BLOCK):
                 own[1, i] = block.floats[0, i]
-        of_step = word(folds_of(block.key, STEP), at.step)
+        of_step = word(folds_of(block.key, STEP), np.uint32(number))
         _walk(
             law, tables.words[2], of_step, own[0], own[1], block.change, block.words[0], block.floats[2],
             block.floats[3], block.legs, block.shares, tables.sigma,

@@ -38,6 +38,7 @@ class Tables(NamedTuple):
         table_of_step: [steps] int64, which of the tables holds for the step's duration.
         of_steps: [2, steps] uint32, words of the steps (positive, negative), written at the start of each block.
         drawn: [4, block] uint32: words of the pixels (positive, negative), and of pixels and step.
+        first: int64, number of the first step.
     """
 
     shot: Any
@@ -45,6 +46,7 @@ class Tables(NamedTuple):
     table_of_step: Any
     of_steps: Any
     drawn: Any
+    first: Any
 
 
 def prepare(value: float, clip: Clip) -> Tables:
@@ -53,7 +55,9 @@ def prepare(value: float, clip: Clip) -> Tables:
     if value > 0.0:
         shot = shot_table(shot_means(value, clip.light, clip.durations))
     drawn, of_steps = np.empty((4, PIXELS_A_BLOCK), np.uint32), np.empty((2, len(clip.table_of_step)), np.uint32)
-    return Tables(shot.view(np.float32), shot.max(axis=2, initial=0), clip.table_of_step, of_steps, drawn)
+    return Tables(
+        shot.view(np.float32), shot.max(axis=2, initial=0), clip.table_of_step, of_steps, drawn, np.int64(clip.first)
+    )
 
 
 def shot_means(shot_noise_hz: float, light: Doubles, durations: Doubles) -> Doubles:
@@ -98,8 +102,8 @@ def start(tables, own, block, at):
             tables.drawn[0, i] = word(pixel_pos, at.first + i)
             tables.drawn[1, i] = word(pixel_neg, at.first + i)
         for step in range(tables.of_steps.shape[1]):
-            tables.of_steps[0, step] = word(step_pos, step)
-            tables.of_steps[1, step] = word(step_neg, step)
+            tables.of_steps[0, step] = word(step_pos, np.uint32(tables.first + step))
+            tables.of_steps[1, step] = word(step_neg, np.uint32(tables.first + step))
 
 
 @hook

@@ -43,6 +43,7 @@ class Clip(NamedTuple):
         key: key of the sample's noise.
         effects: the draw, by field; missing fields are off.
         thresholds: nominal ones, positive and negative, log units.
+        first: number of the first step.
     """
 
     light: npt.NDArray[np.float64]
@@ -54,6 +55,7 @@ class Clip(NamedTuple):
     key: noise.NoiseKey
     effects: Mapping[str, float]
     thresholds: tuple[float, float]
+    first: int = 0
 
 
 class Block(NamedTuple):

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from v2v_server.store.planes import Files, Plane
+from v2v_server.store.planes.plane import Files, Plane
 from v2v_server.video.decode import ClipRequest, Cut, DecodedClip, DecodedPicture
 from v2v_server.video.picture import CHROMA_CELL_PX, Chroma, ChromaCut, Signal
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from v2v_server.store.planes import Files, Plane
+from v2v_server.store.planes.plane import Files, Plane
 from v2v_server.video.decode import ClipRequest, DecodedClip, DecodedPicture
 from v2v_server.video.picture import SDR, Signal
 

@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from v2v_server.store.planes import Files, Plane
+from v2v_server.store.planes.plane import Files, Plane, Stored
 from v2v_server.video.decode import ClipRequest, Cut, DecodedClip, DecodedFrame, DecodedPicture, Watch
 from v2v_server.video.picture import SDR, PixelRect, Signal
 
 if TYPE_CHECKING:
     from v2v_server.motion import Cells, MotionOfCuts, Vectors
-    from v2v_server.store.store_file import StoreFile
 
 
 class Motion(Plane):
@@ -65,7 +64,7 @@ class Motion(Plane):
         """Return the clip with this motion."""
         return replace(clip, motion=value)
 
-    def _is_stored(self, stored: StoreFile, request: ClipRequest) -> bool:
+    def _is_stored(self, stored: Stored, request: ClipRequest) -> bool:
         head = stored.head
         is_usable = request.usable == (head.top, 0, head.rows, head.width_px)
         return request.stride == 1 and is_usable and "motion" in stored.planes
@@ -124,7 +123,7 @@ def _whole(request: ClipRequest, frames: range) -> ClipRequest:
     return replace(request, start=request.start + frames.start * request.stride, cuts=(cut,))
 
 
-def _motion_across(before: StoreFile, after: StoreFile, request: ClipRequest, number: int, cells: Cells) -> Vectors:
+def _motion_across(before: Stored, after: Stored, request: ClipRequest, number: int, cells: Cells) -> Vectors:
     """Return the motion to frame ``number`` of a clip, the first of a file, from the last of the file before."""
     from v2v_server.motion import Pyramid, motion
 

@@ -1,6 +1,6 @@
 """Arrays of a sample that are not made by the kernel: one file for those that share their input.
 
-    frames.py   the frames as the camera sees them
+    frames.py   the frames as the camera sees them, sharp and exposed
     rgb.py      the frames in colour
     flow.py     optical flow, and where it is reliable; the tracks of photographs
     boxes.py    boxes beside the video

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from v2v_server.labels import READERS, BoxTable, kept_boxes, view_boxes
 from v2v_server.worker.arrays.context import SampleContext, fill_rows, makes, only_sidecar
+from v2v_server.worker.job import ClipJob
 
 _KEPT = 4
 """Tables that stay in memory once they are read: siblings use them one after the other."""
@@ -24,17 +25,17 @@ def _table(ending: str, fingerprint: str, picture_px: tuple[int, int], opened: A
     return READERS[ending](opened, picture_px)
 
 
-def read_ahead(
-    video: str, sidecars: Mapping[str, Traversable | None], fingerprints: Mapping[str, str], picture_px: tuple[int, int]
-) -> None:
-    """Read the boxes of a video, so that they are at hand when its sample is made. Errors come again then.
+def read_ahead(clip: ClipJob, sidecars: Mapping[str, Traversable | None]) -> None:
+    """Read the boxes of a clip, if it has them and they are asked for, so that they are at hand when its sample is
+    made. Errors come again then.
 
     Args:
-        video, sidecars, fingerprints, picture_px: as in :class:`~.context.SampleContext` and its clip.
+        clip: whose boxes they are.
+        sidecars: its opened sidecars, by ending.
     """
     with suppress(Exception):
-        ending, opened = only_sidecar("boxes", video, sidecars)
-        _table(ending, fingerprints[ending], picture_px, opened)
+        ending, opened = only_sidecar("boxes", clip.video, sidecars)
+        _table(ending, clip.sidecars[ending].fingerprint, (clip.height_px, clip.width_px), opened)
 
 
 @makes("boxes")

@@ -61,7 +61,7 @@ class SampleContext:
         step_seconds: [steps] float64, duration of each step; None if recipe and arrays do not use it, or if only an
             array would and the video has no known frame rate.
         flow: flow of the clip; None if it was not requested.
-        levels: grey levels between frames (``substep_px``); None if there are none.
+        levels: grey levels between frames (``StreamSpec.levels_per_step``); None if there are none.
         simulated: result of the simulation; None if no array needs events.
     """
 
@@ -88,9 +88,9 @@ class SampleContext:
 
     @property
     def substeps(self) -> int:
-        """Return the number of parts of all steps together; 0 if the spec does not divide steps (``substep_px``)."""
+        """Return the number of parts of all steps together; 0 if the spec divides no step."""
         levels = 0 if self.levels is None else len(self.levels.at.step)
-        return len(self.source) - 1 + levels if self.spec.substep_px else 0
+        return len(self.source) - 1 + levels if self.spec.levels_per_step else 0
 
     @property
     def recipe(self) -> Recipe:

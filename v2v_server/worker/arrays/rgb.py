@@ -37,7 +37,7 @@ def frames_rgb(context: SampleContext, out: npt.NDArray[Any]) -> None:
         view = dataclasses.replace(params, contrast=0.0)
         chroma = np.stack([apply_view(each[:, rows[:, None], columns], view, context.recipe) for each in chroma])
         rows, columns = (np.arange(side, dtype=np.int64) for side in size)
-    # Import lazily: most workers make no colour.
-    from v2v_server.video.rgb import add_colour, differences_of
+    # Import lazily: workers load compiled functions in turn (v2v_server.worker.warm_up).
+    from v2v_server.video.levels import add_colour, differences_of
 
     add_colour(grey[:, 0], chroma, places, rows, columns, differences_of(matrix, params.contrast or 1.0), out)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -41,7 +42,8 @@ from v2v_server.corpus.scenes.scene import (
     clip_pieces,
     firsts_of,
 )  # fmt: skip
-from v2v_server.corpus.scenes.stretches import duplicated, pattern_of, runs_of
+from v2v_server.corpus.scenes.stretches import change_of, duplicated, halt_before, pattern_of, runs_of
+from v2v_server.corpus_words import notes_of
 from v2v_server.system.isolate import run_twice
 from v2v_server.video.rows import Rows
 
@@ -168,7 +170,7 @@ def test_encoding_and_slices(scene: Scene, data: st.DataObject) -> None:
 
 @given(st.binary(max_size=60))
 def test_what_is_no_scene_is_refused(data: bytes) -> None:
-    for content in (data, b"VSC4" + data):
+    for content in (data, analyse(pan(1, 0)).to_bytes()[:4] + data):
         with pytest.raises(ProtocolError):
             Scene.from_bytes(content)
 
@@ -255,7 +257,7 @@ def test_storage_that_fails_while_a_video_is_looked_at_is_asked_again(
     with opened(folder) as first:
         assert left == {"cut": 0, "whole": 0}
         assert not any(video.pieces for video in first.videos)
-        assert any("cut.mkv" in note for note in first.notes)
+        assert any("cut.mkv" in note for note in notes_of(first))
     with opened(folder) as again:
         assert again.scene_digest == digest
 
@@ -315,6 +317,23 @@ MOVING = 64**2 * BLOCKS
 """Sum of squares where each block changes by a grey level."""
 
 
+def repeats_among(changes: list[int]) -> npt.NDArray[np.bool_]:
+    """Return which steps repeat a frame, each of which changes another block."""
+    blocks = np.zeros((len(changes) + 1, BLOCKS), np.int64)
+    for at, change in enumerate(changes):
+        blocks[at + 1 :, at % BLOCKS] += math.isqrt(change)
+    return duplicated(changes, halts_of(blocks, changes), BLOCKS)
+
+
+def halts_of(blocks: npt.NDArray[np.int64], changes: list[int]) -> npt.NDArray[np.bool_]:
+    """Return which steps are counted as halts, by a loop over all of them."""
+    halts = np.zeros(len(changes), bool)
+    for end in range(1, len(changes) + 1):
+        count = halt_before([*blocks[max(0, end - 9) : end + 1]], changes[:end], changes[:end])
+        halts[end - 1 - count : end - 1] = True
+    return halts
+
+
 @given(st.integers(2, 12), st.integers(0, 11), st.integers(0, 2**32))
 def test_one_repeat_in_each_period_is_found_and_named(period: int, offset: int, seed: int) -> None:
     offset, random = offset % period, np.random.default_rng(seed)
@@ -322,7 +341,7 @@ def test_one_repeat_in_each_period_is_found_and_named(period: int, offset: int, 
         MOVING * int(random.integers(1, 4)) if at % period != offset else int(random.integers(0, MOVING // 25 + 1))
         for at in range(10 * period)
     ]
-    flags = duplicated(changes, BLOCKS)
+    flags = repeats_among(changes)
     np.testing.assert_array_equal(flags, np.arange(len(changes)) % period == offset)
     special = {2: "every picture twice", 5: "24 in 30", 6: "25 in 30"}
     assert pattern_of(flags) == special.get(period, f"1 of every {period}")
@@ -338,7 +357,7 @@ def test_one_repeat_in_each_period_is_found_and_named(period: int, offset: int, 
     ],
 )
 def test_what_looks_like_a_repeat(changes: list[int]) -> None:
-    assert not duplicated(changes, BLOCKS).any()
+    assert not repeats_among(changes).any()
 
 
 @pytest.mark.parametrize("repeats", [3, 4])
@@ -347,7 +366,7 @@ def test_a_few_repeats_in_a_long_video_may_be_chance(repeats: int) -> None:
     changes = [MOVING] * 100
     changes[10 : 10 * (repeats + 1) : 10] = [MOVING // 8] * repeats
     changes[11 : 10 * (repeats + 1) + 1 : 10] = [2 * MOVING] * repeats
-    assert duplicated(changes, BLOCKS).sum() == (repeats if repeats >= 4 else 0)
+    assert repeats_among(changes).sum() == (repeats if repeats >= 4 else 0)
 
 
 @given(st.integers(0, 59), st.integers(0, MOVING // 12), st.integers(0, 2**32))
@@ -355,7 +374,106 @@ def test_a_single_repeat_amid_motion_is_found(place: int, change: int, seed: int
     changes = np.random.default_rng(seed).integers(MOVING, 2 * MOVING + 1, 60).tolist()
     changes[place] = change
     expected = [place] if 4 <= place < 56 else []
-    assert np.flatnonzero(duplicated(changes, BLOCKS)).tolist() == expected
+    assert np.flatnonzero(repeats_among(changes)).tolist() == expected
+
+
+@given(st.data(), st.lists(st.sampled_from([0, MOVING // 20, MOVING, 3 * MOVING]), min_size=1, max_size=60))
+def test_repeats_are_looked_for_in_shots_of_any_length(data: st.DataObject, changes: list[int]) -> None:
+    boundaries = sorted(data.draw(st.sets(st.integers(1, len(changes)), max_size=9)))
+    halts = np.array(data.draw(st.lists(st.booleans(), min_size=len(changes), max_size=len(changes))), bool)
+    flags = duplicated(changes, halts, BLOCKS, boundaries)
+    assert flags.shape == halts.shape
+    assert not flags[[boundary - 1 for boundary in boundaries]].any()  # a cut repeats nothing
+
+
+def moved_along(places: list[int]) -> tuple[list[npt.NDArray[np.int64]], list[int]]:
+    """Return the blocks of pictures all of which change alike, and their changes."""
+    blocks = [np.full((10, 10), 256 * place, np.int64) for place in places]
+    return blocks, list(map(change_of, blocks[:-1], blocks[1:]))
+
+
+@pytest.mark.parametrize(
+    ("places", "halts"),
+    [
+        pytest.param([0, 10, 10, 20], 1, id="a repeat"),
+        pytest.param([0, 10, 11, 21], 1, id="a repeat that a coder blends"),
+        pytest.param([0, 10, 10, 10, 20], 2, id="two of three"),
+        pytest.param([0, *[10] * 8, 20], 7, id="seven repeats"),
+        pytest.param([0, 10, 14, 14, 24], 1, id="the next step makes up for it"),
+        pytest.param([0, 10, 10, 0], 0, id="a turn"),
+        pytest.param([0, 10, 12, 2], 0, id="a turn between two frames"),
+        pytest.param([0, 10, 10, 3], 0, id="a turn of uneven speed"),
+        pytest.param([0, 10, 15, 25], 0, id="slower, not small"),
+        pytest.param([0, 2, 3, 13], 0, id="motion begins"),
+        pytest.param([10, 10, 20], 0, id="nothing is known of the step before"),
+    ],
+)
+def test_where_a_picture_halts(places: list[int], halts: int) -> None:
+    blocks, changes = moved_along(places)
+    assert halt_before(blocks, changes, changes) == halts
+    pixels = [max(changes)] * len(changes)
+    assert halt_before(blocks, changes, pixels) == 0, "something smaller than a block moves"
+
+
+@given(st.integers(1, 60), st.integers(-200, 200), st.integers(1, 9))
+def test_no_turn_at_constant_acceleration_is_a_halt(pace: int, phase: int, scale: int) -> None:
+    blocks, changes = moved_along([scale * (pace * at + phase) ** 2 for at in range(-5, 6)])
+    assert not halts_of(np.array(blocks), changes).any()
+
+
+def to_and_fro(what: str, hertz: float, size: float, reach: float, frames: int = 60, rate: float = 30.0) -> Luma:
+    """Return something that swings, flickers or turns over a photograph, with soft edges, [frames, 72, 104].
+
+    Args:
+        size: radius, px; of a metronome half the width of its arm.
+        reach: amplitude, px; of a lamp grey levels; of a wheel its radius.
+    """
+    at = 2 * np.pi * hertz / rate * np.arange(frames)[:, None, None] + 0.4
+    row, column = np.mgrid[:72, :104] - np.array([36, 52])[:, None, None]
+    scene = pan(1, 0, 72, 104)[0] / 3 + 40.0
+    if what == "lamp":
+        return np.rint(scene + 80 + reach * np.sin(at) * np.exp(-(row**2 + column**2) / (8 * size**2))).astype(np.uint8)
+    if what == "swing":
+        shown = size - np.hypot(column - reach * np.sin(at), row - reach / 4 * np.cos(2 * at))
+    elif what == "wheel":
+        spokes = size - np.abs(np.sin(5 * (np.arctan2(row, column) - at) / 2)) * np.hypot(row, column)
+        shown = np.minimum(spokes, reach - np.hypot(row, column))
+    else:
+        angle = reach / 60 * np.sin(at)
+        shown = size - np.abs((36 - row) * np.sin(angle) - column * np.cos(angle))
+    share = np.clip(shown + 0.5, 0, 1)
+    return np.rint(scene * (1 - share) + 225 * share).astype(np.uint8)
+
+
+@pytest.mark.parametrize("rate", [24.0, 30.0, 60.0])
+@pytest.mark.parametrize(
+    ("what", "size", "reach"),
+    [
+        ("swing", 9, 30),
+        ("swing", 3, 36),
+        ("lamp", 9, 40),
+        ("lamp", 20, 6),
+        ("wheel", 3, 30),
+        ("metronome", 3, 30),
+        ("metronome", 1, 12),
+    ],
+)
+def test_what_swings_flickers_or_turns_loses_no_frame(what: str, size: float, reach: float, rate: float) -> None:
+    """At its turns a step is as small as a repeat, but then the picture comes back."""
+    lost = {}
+    for hertz in (1.0, 2.0, 3.3, 5.0, 7.5, 10.0, 10.66, 12.0):
+        kept = analyse(to_and_fro(what, hertz, size, reach, rate=rate)).frames_from(0, 60)
+        lost[hertz] = int(np.count_nonzero(kept >= 60))
+    assert set(lost.values()) == {0}, lost
+
+
+@pytest.mark.parametrize("what", ["swing", "lamp", "metronome"])
+def test_repeats_of_what_swings_are_found(what: str) -> None:
+    luma = to_and_fro(what, 1.0, 9 if what != "metronome" else 3, 30)
+    for source in (np.arange(60) * 4 // 5, np.arange(60) // 2, np.arange(60) * 2 // 5):
+        flags = np.concatenate([[False], np.diff(source) == 0])
+        kept = analyse(luma[source]).frames_from(0, int((~flags).sum()))
+        assert np.isin(kept, np.flatnonzero(~flags)).mean() > 0.8
 
 
 @given(st.lists(st.booleans(), max_size=40), st.integers(1, 5), st.integers(0, 3))

@@ -40,7 +40,7 @@ SIZE = 1000
 @pytest.fixture(autouse=True)
 def _no_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bucket_module, "_FIRST_WAIT_SECONDS", 0.001)
-    monkeypatch.setattr("v2v_server.corpus.sources.copies._ROOM_SECONDS", 0.01)
+    monkeypatch.setattr("v2v_server.corpus.sources.copy_folder._ROOM_SECONDS", 0.01)
 
 
 @pytest.fixture
@@ -59,20 +59,22 @@ _MADE: list[Copies] = []
 def _nothing_held() -> Iterator[None]:
     yield
     while _MADE:
-        _MADE.pop().release()
+        _MADE.pop().copies.release()
 
 
 def copies(store: Path, most: int = 10 * SIZE) -> Copies:
     made = Copies(Bucket(f"file://{store}"), store.parent / "copies", most)
-    made.make()
+    made.copies.make()
     _MADE.append(made)
     return made
 
 
 def files(made: Copies) -> set[bytes]:
     """The first byte of each copy."""
-    found = list(made.copies.glob("??/*"))
-    assert sum(path.stat().st_size for path in found) == used_bytes(made.copies) == count_bytes(made.copies)
+    found = list(made.copies.folder.glob("??/*"))
+    assert (
+        sum(path.stat().st_size for path in found) == used_bytes(made.copies.folder) == count_bytes(made.copies.folder)
+    )
     return {path.read_bytes()[:1] for path in found}
 
 
@@ -106,8 +108,8 @@ def test_a_video_is_fetched_once(store: Path) -> None:
     assert made.has({"a.mp4": f"{mark}-content"})
     with made.open_local("a.mp4", f"{mark}-content") as path:
         assert path.stat().st_size == SIZE
-    assert [each.name for each in (made.copies / PARTIAL).iterdir() if each.suffix != ".lock"] == []
-    found = [path for path in made.copies.rglob("*") if path.is_file()]
+    assert [each.name for each in (made.copies.folder / PARTIAL).iterdir() if each.suffix != ".lock"] == []
+    found = [path for path in made.copies.folder.rglob("*") if path.is_file()]
     assert {path.suffix for path in found} >= {".mp4", ".lock"}
     modes = {path.suffix == ".lock": stat.S_IMODE(path.stat().st_mode) for path in found}
     assert modes == {False: 0o600, True: 0o200}, "other users cannot lock a copy"
@@ -132,27 +134,27 @@ def test_what_was_fetched_to_be_probed_is_not_fetched_again(store: Path) -> None
         pass
     with made.open_local("a.mp4", "") as reading:
         for _ in range(3):  # as several processes do
-            made.keep_as("a.mp4", mark, f"{mark}-content")
+            made.copies.keep_as("a.mp4", mark, f"{mark}-content")
         assert reading.read_bytes() == (store / "a.mp4").read_bytes()
-    assert used_bytes(made.copies) == 2 * SIZE  # under two names while it was read
-    made.keep_as("a.mp4", mark, f"{mark}-content")
-    assert used_bytes(made.copies) == SIZE
+    assert used_bytes(made.copies.folder) == 2 * SIZE  # under two names while it was read
+    made.copies.keep_as("a.mp4", mark, f"{mark}-content")
+    assert used_bytes(made.copies.folder) == SIZE
     (store / "a.mp4").unlink()
     assert made.has({"a.mp4": f"{mark}-content"})
-    made.keep_as("b.mp4", "absent", "absent-content")
-    assert [each.name for each in (made.copies / PARTIAL).iterdir() if each.suffix != ".lock"] == []
+    made.copies.keep_as("b.mp4", "absent", "absent-content")
+    assert [each.name for each in (made.copies.folder / PARTIAL).iterdir() if each.suffix != ".lock"] == []
 
 
 def test_a_slot_that_another_process_keeps_is_not_waited_for(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(copies_module, "_SLOT_SECONDS", 0.0)
+    monkeypatch.setattr("v2v_server.corpus.sources.copy_folder._SLOT_SECONDS", 0.0)
     made, mark = copies(store), fingerprint(store / "a.mp4")
     with ExitStack() as held:
         for number in range(63):
-            lock = held.enter_context((made.copies / PARTIAL / f"{number:02}.lock").open("wb"))
+            lock = held.enter_context((made.copies.folder / PARTIAL / f"{number:02}.lock").open("wb"))
             fcntl.flock(lock, fcntl.LOCK_EX)
         made.fetch({"a.mp4": mark})
         assert made.has({"a.mp4": mark})
-        last = held.enter_context((made.copies / PARTIAL / "63.lock").open("wb"))
+        last = held.enter_context((made.copies.folder / PARTIAL / "63.lock").open("wb"))
         fcntl.flock(last, fcntl.LOCK_EX)
         with pytest.raises(VideoUnreadable, match="other processes keep all 64 of its slots"):
             made.fetch({"b.mp4": fingerprint(store / "b.mp4")})
@@ -238,7 +240,7 @@ def test_what_was_not_read_for_longest_goes(store: Path) -> None:
             pass
     assert files(made) == {b"\0", b"\1"}
     assert made.has({"a.mp4": marks["a.mp4"]})  # read again: b is the older one now
-    made.release()
+    made.copies.release()
     made.fetch({"deep/c.mp4": marks["deep/c.mp4"]})
     assert b"\1" not in files(made)
     assert b"\2" in files(made)
@@ -262,7 +264,7 @@ def _read(plain: bytes, marks: dict[str, str], turns: int) -> set[tuple[str, byt
         for name, mark in marks.items():
             with made.open_local(name, mark) as path:
                 got.add((name, path.read_bytes()))
-    made.release()
+    made.copies.release()
     return got
 
 
@@ -289,7 +291,7 @@ def test_addresses_that_cannot_be(store: Path, tmp_path: Path) -> None:
         copies(store).fetch({"../a.mp4": "1-2"})
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(CorpusError, match="cannot be written to"):
-        Copies(Bucket("file:///x"), tmp_path / "file", 1).make()
+        Copies(Bucket("file:///x"), tmp_path / "file", 1).copies.make()
     for limit in (0.0, float("inf")):
         with pytest.raises(UsageError, match=f"--copies-gib {limit:g}"):
             open_source("file:///x", SourceOptions(copies=tmp_path, copies_gib=limit))
@@ -411,16 +413,16 @@ def test_an_object_of_another_mark_is_read_whole(clips: Path, monkeypatch: pytes
 
     def fetched() -> bytes:
         made = copies(clips, 1 << 30)
-        made.expect("a.avi", state)
+        made.expected = "a.avi", state
         try:
             made.fetch(wanted)
             with made.open_local("a.avi", wanted["a.avi"]) as path:
                 return path.read_bytes()
         finally:
-            made.release()
-            for path in made.copies.glob("??/*"):
+            made.copies.release()
+            for path in made.copies.folder.glob("??/*"):
                 path.unlink()
-            assert [each.name for each in (made.copies / PARTIAL).iterdir() if each.suffix != ".lock"] == []
+            assert [each.name for each in (made.copies.folder / PARTIAL).iterdir() if each.suffix != ".lock"] == []
 
     assert (fetched(), read) == (right, []), "the mark is that of the catalogue"
     file.write_bytes(wrong)

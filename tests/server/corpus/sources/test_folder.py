@@ -15,9 +15,10 @@ from tests.clips import panned_luma, write_clip
 from v2v_protocol.errors import CorpusError
 from v2v_protocol.programs import printable
 from v2v_server.corpus.catalogue import open_catalogue
-from v2v_server.corpus.sources import source as asking
+from v2v_server.corpus.sources import listing as asking
 from v2v_server.corpus.sources.folder import MOST_PATHS, PSEUDO, Folder, video_files
-from v2v_server.corpus.sources.source import ListEntry, answers, by_parts, left_out_note, open_source, read_list
+from v2v_server.corpus.sources.listing import ListEntry, answers, by_parts, left_out_note, read_list
+from v2v_server.corpus.sources.source import open_source
 
 STEERING = {
     "red\x1b[31m.mp4": r"red\x1b[31m.mp4",

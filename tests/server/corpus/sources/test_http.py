@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.server
+import re
 import threading
 from collections.abc import Iterator
 from contextlib import closing
@@ -30,6 +31,7 @@ class Web(http.server.ThreadingHTTPServer):
         manner: how sizes are told: "length", "close", "chunked", "no head".
         status: of all answers but those of listings.
         marks: header that names the state of the files, "" for none.
+        ranges: whether parts of files can be asked for.
         asked: methods and paths so far.
     """
 
@@ -38,6 +40,7 @@ class Web(http.server.ThreadingHTTPServer):
         self.url = f"http://127.0.0.1:{self.server_address[1]}"
         self.files: dict[str, bytes | str] = {}
         self.manner, self.marks, self.status = "length", "ETag", 200
+        self.ranges = False
         self.asked: list[str] = []
 
 
@@ -62,12 +65,18 @@ class Answer(http.server.BaseHTTPRequestHandler):
         status = web.status if found is not None and not is_listing else 404 if found is None else 200
         if web.manner == "no head" and body is not None:
             status = 405
+        mark, span = hash(data), re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("Range", ""))
+        if web.ranges and span and status == 200 and not is_listing:
+            status, first, size = 206, int(span[1]), len(data)
+            data = data[first : int(span[2]) + 1]
         self.send_response(status)
+        if status == 206:
+            self.send_header("Content-Range", f"bytes {first}-{first + len(data) - 1}/{size}")
         self.send_header("Content-Type", "text/html" if is_listing else "video/mp4")
         if web.marks and not is_listing:
-            self.send_header(web.marks, f'"{hash(data)}"')
-        manner = "length" if is_listing or status != 200 else web.manner
-        body = (data if status == 200 else b"") if body is None else body
+            self.send_header(web.marks, f'"{mark}"')
+        manner = "length" if is_listing or status not in (200, 206) else web.manner
+        body = (data if status in (200, 206) else b"") if body is None else body
         if manner == "chunked":
             self.send_header("Transfer-Encoding", "chunked")
             body = b"%x\r\n%s\r\n0\r\n\r\n" % (len(body), body) if body else b""
@@ -75,7 +84,7 @@ class Answer(http.server.BaseHTTPRequestHandler):
             self.send_header("Connection", "close")
             self.close_connection = True
         else:
-            self.send_header("Content-Length", str(len(data) if status == 200 else 0))
+            self.send_header("Content-Length", str(len(data) if status in (200, 206) else 0))
         self.end_headers()
         self.wfile.write(body)
 

@@ -1,1 +1,0 @@
-"""The former place of :class:`v2v_client.Patience`."""

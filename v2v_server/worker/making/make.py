@@ -1,0 +1,256 @@
+"""Make a sample from its decoded clip: view, flow, simulation, arrays and provenance."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from importlib.resources.abc import Traversable
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from v2v_protocol import NUMERICS_VERSION
+from v2v_protocol.errors import SidecarError, UsageError, V2VError, VideoError
+from v2v_protocol.events import EventList, whole_edges
+from v2v_protocol.sample import ARRAYS, Needs, Provenance, Sample, SampleId, needs_of, new_arrays, sidecar_endings
+from v2v_protocol.spec import MARGIN_PX
+from v2v_server.flow import flow_for
+from v2v_server.motion import levels_of
+from v2v_server.simulation.clip import simulate_clip
+from v2v_server.simulation.intensity import eight_bits
+from v2v_server.simulation.kernels import Voxels, list_events
+from v2v_server.simulation.representations import NAMES
+from v2v_server.simulation.view import apply_view, without_margin
+from v2v_server.simulation.voxel import step_seconds
+from v2v_server.video.decode import DecodedClip
+from v2v_server.video.picture import SDR
+from v2v_server.worker.arrays.context import ARRAY_BUILDERS, SampleContext, SourceClip
+from v2v_server.worker.job import ClipJob, SampleJob
+from v2v_server.worker.making.read import Decoded
+from v2v_server.worker.scene_choice import usable_window, within_rows
+
+_LONGEST_REASON = 500
+
+
+def make_sample(
+    job: SampleJob,
+    decoded: Decoded,
+    into: Mapping[str, npt.NDArray[Any]] | None = None,
+    sidecars: Mapping[str, Traversable | None] = MappingProxyType({}),
+) -> Sample:
+    """Make a sample from its decoded clip: view, flow, simulation.
+
+    Args:
+        job: which sample.
+        decoded: its decoded clip.
+        into: C-contiguous arrays of the job's layout to fill; None allocates them.
+        sidecars: what :func:`open_sidecars` lends; needed if an array is made from one.
+
+    Raises:
+        SidecarError: this host cannot read a sidecar.
+        VideoError: the video's frame rate is unknown and the recipe needs it, or its stated thresholds or time stamps
+            are beyond what can be simulated.
+    """
+    plan, clip, stamp = decoded.plan, job.clip, job.stamp
+    arrays = new_arrays(clip.layout) if into is None else into
+    context, irregular = sample_context(clip, decoded, needs_of(arrays), sidecars)
+    unlabelled = {
+        name: f"{clip.video}: its frame rate is unknown, and {name} needs it"
+        for name in arrays
+        if not context.can_time(name)
+    }
+    if any(ARRAYS[name].needs.events for name in arrays if name not in unlabelled):
+        of_kernel = {name: arrays[name] for name in NAMES if name in arrays and name not in unlabelled}
+        context = replace(context, simulated=simulate(context, of_kernel))
+    dropped = dict[str, int]()
+    for name, array in arrays.items():
+        if name in decoded.clip.arrays:
+            array[...] = decoded.clip.arrays[name]
+        elif name not in NAMES and name not in unlabelled:
+            try:
+                with errors_of_sidecar(clip.video, name, sidecars, clip.refused_sidecars):
+                    dropped[name] = ARRAY_BUILDERS[name](context, array) or 0
+            except SidecarError as error:
+                if error.here:
+                    raise
+                unlabelled[name] = str(error)
+    for name in unlabelled:
+        arrays[name][...] = ARRAYS[name].empty
+    made = context.simulated
+    saturated = {} if made is None else dict(made.saturated)
+    saturated_bins = saturated.pop("voxels", 0)
+    return Sample(
+        arrays=arrays,
+        provenance=Provenance(
+            id=SampleId(stamp.spec_digest, stamp.catalogue_digest, NUMERICS_VERSION, clip.seed, clip.epoch, job.index),
+            video=clip.video,
+            fingerprint=clip.fingerprint,
+            start_frame=clip.start_frame,
+            candidate=stamp.candidate,
+            refusals=stamp.refusals,
+            params=plan.params,
+            saturated_bins=saturated_bins,
+            irregular_timestamps=irregular,
+            decoder=_decoder(decoded.clip),
+            quarantine=stamp.quarantine,
+            scene="" if plan.flow_plan is None else plan.flow_plan.reason,
+            sidecars=dict(context.clip.fingerprints),
+            unlabelled=unlabelled,
+            boxes_dropped=dropped.pop("boxes", 0),
+            dropped={name: count for name, count in dropped.items() if count},
+            saturated={name: count for name, count in saturated.items() if count},
+            grid_seconds=_grid_seconds(context),
+            substeps=0 if made is None else context.substeps,
+            remark=stamp.remark,
+        ),
+    )
+
+
+def list_sample_events(clip: ClipJob, decoded: Decoded) -> EventList:
+    """List the events of a sample with their times, which are those of the video's frames.
+
+    Raises:
+        VideoError: as :func:`make_sample`; or the video's frame rate is unknown.
+    """
+    context, _ = sample_context(clip, decoded, Needs(events=True, seconds="must"))
+    made = simulate(context, {})
+    return list_events(made.given, made.real, 1e6 * made.given.step_seconds)
+
+
+def span_ends_us(clip: ClipJob, decoded: Decoded) -> npt.NDArray[np.int64]:
+    """Return the times between which a sample's spans lie, [recipe.spans + 1], microseconds as of its events.
+
+    Raises:
+        VideoError: the video's frame rate is unknown.
+    """
+    seconds, _ = _step_seconds(clip, decoded)
+    times_us = whole_edges(1e6 * np.concatenate([[0.0], np.cumsum(seconds)]))
+    return times_us[decoded.plan.params.ends(clip.spec.recipe)]
+
+
+def sample_context(
+    clip: ClipJob,
+    decoded: Decoded,
+    needs: Needs,
+    sidecars: Mapping[str, Traversable | None] = MappingProxyType({}),
+) -> tuple[SampleContext, int]:
+    """Return what arrays with these needs are made from, and the number of irregular time stamps; no simulation.
+
+    Raises:
+        VideoError: the video's frame rate is unknown, and the recipe or an array must have it.
+    """
+    plan, read, spec, recipe = decoded.plan, decoded.clip, clip.spec, clip.spec.recipe
+    params, frames, signal, flow, levels = plan.params, read.frames, read.signal, None, read.levels
+    if plan.flow is not None and needs.flow and "flow" not in read.arrays:
+        methods = () if plan.flow_plan is None else plan.flow_plan.methods
+        part = without_margin(frames, params, recipe, plan.margin_px, plan.flow.margin_px)
+        flow = flow_for(
+            eight_bits(part, signal), params, recipe, plan.flow, validity=needs.flow == "checked", plan=methods
+        )
+    if read.motion is not None and read.motion.any() and (needs.events or needs.levels):
+        part = without_margin(frames, params, recipe, plan.margin_px, MARGIN_PX)
+        picture = within_rows(clip, plan.frames.sides)
+        levels = levels_of(part, params, recipe, plan.source, spec.substep_px, read.motion, picture)
+    # An array must not make a video unusable for the others: without a rate, it is left empty.
+    is_timed = recipe.needs_seconds or needs.seconds == "must" or (bool(clip.frames_per_second and needs.seconds))
+    seconds, irregular = _step_seconds(clip, decoded) if is_timed else (None, 0)
+    view = frames
+    if not read.is_view:
+        view = apply_view(without_margin(frames, params, recipe, plan.margin_px), params, recipe, signal)
+    origin = SourceClip(
+        clip.start_frame,
+        read.seconds,
+        None if plan.cut.chroma is None or read.chroma is None else (read.chroma, plan.cut.chroma),
+        sidecars,
+        fingerprints={ending: sidecar.fingerprint for ending, sidecar in clip.sidecars.items()},
+        numbers=plan.frames.numbers,
+        picture_px=(clip.height_px, clip.width_px),
+        usable=usable_window(clip, plan.frames.sides),
+    )
+    return SampleContext(clip.video, origin, spec, params, plan.source, view, signal, seconds, flow, levels), irregular
+
+
+def simulate(context: SampleContext, out: Mapping[str, npt.NDArray[Any]]) -> Voxels:
+    """Simulate the sample into ``out``, arrays that the kernel makes, such as voxels [T, bins, H, W], by name.
+
+    Raises:
+        VideoError: thresholds or time stamps that the corpus states for the video are beyond what can be simulated.
+    """
+    try:
+        return simulate_clip(
+            context.view,
+            context.params,
+            context.recipe,
+            context.spec.voxel_dtype,
+            context.step_seconds,
+            out,
+            context.levels,
+            context.signal,
+        )
+    except UsageError as error:
+        # The recipe was checked before, so the values come from the corpus.
+        raise VideoError(context.video, None, f"cannot be simulated: {error}") from error
+
+
+def _grid_seconds(context: SampleContext) -> tuple[float, ...]:
+    """Return the actual duration of each voxel grid if the recipe states one."""
+    if not context.recipe.is_timed or context.step_seconds is None:
+        return ()
+    return tuple(np.add.reduceat(context.step_seconds, context.params.ends(context.recipe)[:-1]).tolist())
+
+
+def _step_seconds(clip: ClipJob, decoded: Decoded) -> tuple[npt.NDArray[np.float64], int]:
+    """Call :func:`step_seconds` for a clip."""
+    if not clip.frames_per_second:
+        why = "the recipe needs seconds" if clip.spec.recipe.needs_seconds else "events need times"
+        raise VideoError(clip.video, None, f"its frame rate is unknown, and {why}")
+    rate = clip.frames_per_second / clip.spec.recipe.frame_stride
+    return step_seconds(decoded.clip.seconds, decoded.plan.source, rate)
+
+
+def _decoder(clip: DecodedClip) -> str:
+    """Describe the source of the pixels for the provenance."""
+    signal = "" if clip.signal == SDR else f", {clip.signal}"
+    host = "" if clip.bit_exact else " (host-dependent)"
+    return f"{clip.codec}{host}{signal}" + (f", from the {clip.origin}" if clip.origin else "")
+
+
+@contextmanager
+def errors_of_sidecar(
+    video: str,
+    array: str,
+    sidecars: Mapping[str, Traversable | None],
+    refused: Mapping[str, str] = MappingProxyType({}),
+) -> Iterator[None]:
+    """Turn any error while an array is made from a sidecar into a SidecarError: a malformed file must end no worker.
+
+    Args:
+        video: catalogue id.
+        array: name of the array.
+        sidecars: what :func:`open_sidecars` lends.
+        refused: see :class:`v2v_server.worker.job.ClipJob`.
+
+    Raises:
+        SidecarError: the array cannot be made from its sidecar.
+    """
+    endings = sidecar_endings((array,))
+    if problems := [refused[ending] for ending in endings if ending in refused]:
+        there = [ending for ending in endings if ending in refused or sidecars.get(ending) is not None]
+        why = problems[0] if len(there) == 1 else f"there are {len(there)}: keep one"
+        raise SidecarError(video, " or ".join(there), why)
+    try:
+        yield
+    except V2VError:
+        raise
+    except Exception as error:
+        for ending in endings:
+            if sidecars.get(ending) is not None:
+                plain = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+                reason = f"{plain}{error}"[:_LONGEST_REASON]
+                # A read error is this host's; any other repeats wherever the sidecar is read.
+                here = isinstance(error, OSError) and not isinstance(error, FileNotFoundError)
+                raise SidecarError(video, ending, reason, here) from error
+        raise
