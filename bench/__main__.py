@@ -37,6 +37,7 @@ BENCHES = {
     "link": "speed.link",
     "step": "speed.step",
     "evt3": "speed.evt3",
+    "whole": "speed.whole",
     "physics": "accuracy.physics",
     "motion": "speed.motion",
     "substeps": "accuracy.substeps",

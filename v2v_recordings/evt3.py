@@ -174,19 +174,22 @@ class Encoder:
         """
         if not len(chunk):
             return np.empty(0, WORD)
-        t_us, y = chunk.t_ns // 1000, chunk.y.astype(np.int64)
-        steps, end_us = np.diff(t_us, prepend=self._t_us), FORM_LIMITS["EVT 3"].end_us
-        if min(steps.min(), t_us[0]) < 0 or t_us[-1] >= end_us:
+        t_us, end_us = chunk.t_ns // 1000, FORM_LIMITS["EVT 3"].end_us
+        if min(t_us[0], t_us[0] - self._t_us) < 0 or (t_us[1:] < t_us[:-1]).any() or t_us[-1] >= end_us:
             raise UsageError(
                 f"events at {t_us.min()} to {t_us.max()} us: EVT 3 takes times in order, from 0 to {end_us - 1} us"
             )
-        high, is_later = t_us // HIGH_US, steps > 0
-        is_moved = np.diff(y, prepend=self._row) != 0
-        ends = np.cumsum(np.diff(high, prepend=self._high) + is_later + is_moved + 1)
-        words = np.full(ends[-1], 0x8 << 12, WORD)
-        words[ends - 1] = 0x2 << 12 | chunk.p.astype(np.int64) << 11 | chunk.x
-        words[ends[is_moved] - 2] = y[is_moved]
-        words[(ends - is_moved)[is_later] - 2] = 0x6 << 12 | t_us[is_later] % HIGH_US
-        words[words == 0x8 << 12] |= (np.arange(self._high + 1, high[-1] + 1) % ROUND).astype(WORD)
-        self._t_us, self._high, self._row = int(t_us[-1]), int(high[-1]), int(y[-1])
+        table, is_sent = np.empty((len(t_us), 3), WORD), np.ones((len(t_us), 3), bool)
+        table[:, 0], table[:, 1] = 0x6000 | t_us & 0xFFF, chunk.y
+        table[:, 2] = 0x2000 | chunk.p.astype(WORD) << 11 | chunk.x.astype(WORD)
+        is_sent[0, :2] = t_us[0] > self._t_us, chunk.y[0] != self._row
+        is_sent[1:, 0], is_sent[1:, 1] = t_us[1:] > t_us[:-1], chunk.y[1:] != chunk.y[:-1]
+        sent = np.flatnonzero(is_sent)
+        words, high = table.reshape(-1)[sent], t_us // HIGH_US
+        risen = np.diff(high, prepend=self._high)
+        if len(places := np.flatnonzero(risen)):
+            highs = 0x8000 | (np.arange(self._high + 1, high[-1] + 1) % ROUND).astype(WORD)
+            words = np.insert(words, np.repeat(np.searchsorted(sent, 3 * places), risen[places]), highs)
+            self._high = int(high[-1])
+        self._t_us, self._row = int(t_us[-1]), int(chunk.y[-1])
         return words

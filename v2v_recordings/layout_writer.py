@@ -105,6 +105,12 @@ def open_new(path: Path) -> Iterator[tuple[h5py.File, _Disk]]:
             disk.check()  # what could not be written cannot be read back either
 
 
+def append(dataset: h5py.Dataset, values: npt.NDArray[Any]) -> None:
+    """Append values, [n], to a dataset, [N]."""
+    dataset.resize(len(dataset) + len(values), axis=0)
+    dataset[len(dataset) - len(values) :] = values
+
+
 class RecordingWriter:
     """Write a recording inside a ``with`` block. A normal exit completes the file, an exception removes it.
 
@@ -258,9 +264,7 @@ class RecordingWriter:
             max(self._largest.width, int(x.max()) + 1), max(self._largest.height, int(y.max()) + 1)
         )
         for name, values in zip(_COLUMNS, ((events.t_ns - (self._origin_ns or 0)) * 1e-9, x, y, events.p), strict=True):
-            dataset = self._file[f"events/{name}"]
-            dataset.resize(self._events + len(events), axis=0)
-            dataset[self._events :] = values
+            append(self._file[f"events/{name}"], values)
         self._events += len(events)
         self._last_ns = int(events.t_ns[-1])
 

@@ -12,10 +12,9 @@ import os
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import IO, Any, ClassVar, NamedTuple, Self
+from typing import IO, Any, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -31,13 +30,16 @@ from v2v_recordings.limits import FORM_LIMITS, check_size, fits
 
 _NOTE = "simulated from video frames: log intensity is linear in time between frames"
 EVENTS_AT_ONCE = 1 << 16
+_NO_EVENTS = EventChunk(np.empty(0, np.int64), np.empty(0, np.uint16), np.empty(0, np.uint16), np.empty(0, bool))
+_Written = Generator[None, EventChunk | None, None]
+"""A file that is being written: it is sent pieces of EVENTS_AT_ONCE events, the last of which may be shorter, and None
+at their end. To close it earlier removes its parts.
+"""
 PLANES: Mapping[str, tuple[str, tuple[int, ...]]] = {"images": ("u1", ()), "flow": ("<f4", (2,)), "masks": ("u1", ())}
 """dtype of each kind of pictures that some forms hold beside events, and its axes before [H, W]."""
 
 
-def open_writer(
-    path: Path, form: str, size: tuple[int, int], planes: Sequence[str] = (), *, source: str = "v2v-simulate"
-) -> EventWriter:
+def open_writer(path: Path, form: str, size: tuple[int, int], planes: Sequence[str] = ()) -> EventWriter:
     """Return the writer of a recording; see :class:`EventWriter`.
 
     Args:
@@ -45,7 +47,6 @@ def open_writer(
         form: key of EVENT_FORMS.
         size: width and height, px.
         planes: keys of PLANES that will be added.
-        source: name of the maker, for forms that keep it.
 
     Raises:
         UsageError: see :func:`check_form`; ``path`` is a folder that holds something; or the file cannot be created.
@@ -53,7 +54,7 @@ def open_writer(
     check_form(path, form, size, planes)
     if path.is_dir() and (form != "evreal" or any(path.iterdir())):
         raise UsageError(f"{path} is a folder, and is not replaced: give another name, or remove it")
-    return EVENT_FORMS[form].writer(path, form, size, planes, source)
+    return EventWriter(path, form, size, planes)
 
 
 def check_form(path: Path, form: str, size: tuple[int, int], planes: Sequence[str] = ()) -> None:
@@ -94,52 +95,50 @@ def write_events(path: Path, events: EventList) -> None:
 class EventWriter:
     """Write a recording inside a ``with`` block. A normal exit completes the file, an exception removes its parts.
 
+    Attributes:
+        events: number of those added.
+
     Raises:
         UsageError: events step back, or are outside of the picture or the form's times; a plane has another shape, or
             was not announced; or the file cannot be written further, for instance on a full disk.
     """
 
-    def __init__(self, path: Path, form: str, size: tuple[int, int], planes: Sequence[str], source: str) -> None:
-        self._path, self._form, self._size, self._source = path, form, SensorSize(*size), source
-        self._pending: list[EventList] = []
-        self._pending_events = self._last_us = 0
-        self._stamps: dict[str, list[int]] = {name: [] for name in planes}
-        self._planes: dict[str, _Rows] = {}
-        self.events, self._is_closed = 0, False
-        self._files = contextlib.ExitStack()
-        with contextlib.ExitStack() as opening:
-            opening.push(self._files)  # closed only after an error
-            try:
-                self._open()
-                for name in planes:
-                    dtype, axes = PLANES[name]
-                    self._planes[name] = _Rows(self._plane_file(name), dtype, self._plane_shape(axes))
-            except OSError as error:
-                raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
-            opening.pop_all()
+    def __init__(self, path: Path, form: str, size: tuple[int, int], planes: Sequence[str]) -> None:
+        self._path, self._limit, self._size = path, EVENT_FORMS[form].limit, SensorSize(*size)
+        self._pending, self._last_us, self.events = _NO_EVENTS, 0, 0
+        with contextlib.ExitStack() as files, self._words():
+            self._planes = {name: _Planes(files.enter_context(_unnamed(path)), name, self._size) for name in planes}
+            self._file = EVENT_FORMS[form].write(path, self._size, self._planes)
+            next(self._file)
+            self._files = files.pop_all()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is None:
-            self.close()
-        else:
-            self._files.__exit__(kind, error, trace)
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        with self._files, self._words(), contextlib.suppress(StopIteration):
+            if kind is not None:
+                self._file.close()
+                return
+            if len(self._pending):
+                self._file.send(self._pending)
+            self._file.send(None)
 
     def add(self, events: EventList) -> None:
         """Add the next events, in order of time, microseconds from 0 on."""
         if not len(events):
             return
         self._check(events)
-        self._last_us = int(events.t[-1])
-        self.events += len(events)
-        self._pending.append(events)
-        self._pending_events += len(events)
-        if self._pending_events >= EVENTS_AT_ONCE:
-            self._flush(self._pending_events // EVENTS_AT_ONCE * EVENTS_AT_ONCE)
+        self._last_us, self.events = int(events.t[-1]), self.events + len(events)
+        taken = 0
+        while taken < len(events):
+            part = slice(taken, taken + EVENTS_AT_ONCE - len(self._pending))
+            piece = EventChunk(events.t[part] * 1000, events.x[part], events.y[part], events.p[part])
+            self._pending, taken = EventChunk.join([self._pending, piece]), taken + len(piece)
+            if len(self._pending) == EVENTS_AT_ONCE:
+                with self._words():
+                    self._file.send(self._pending)
+                self._pending = _NO_EVENTS
 
     def add_picture(self, microseconds: int, picture: npt.NDArray[np.uint8]) -> None:
         """Add a picture, uint8 [H, W], not earlier than the one before it. Its events may be added before or after."""
@@ -153,34 +152,24 @@ class EventWriter:
         """
         if kind not in self._planes:
             raise UsageError(f"{self._path}: {kind} were not announced when it was opened: name them in planes")
-        shape, stamps = (*PLANES[kind][1], self._size.height, self._size.width), self._stamps[kind]
-        if plane.shape != shape or microseconds < max(stamps[-1:], default=0):
+        shape, planes = (*PLANES[kind][1], self._size.height, self._size.width), self._planes[kind]
+        if plane.shape != shape or microseconds < max(planes.stamps_us[-1:], default=0):
             raise UsageError(
                 f"{self._path}: {kind} {list(plane.shape)} at {microseconds} us; they must be {list(shape)}, in order "
                 "of time from 0 us on"
             )
         with self._words():
-            self._planes[kind].append(plane[None])
-        stamps.append(microseconds)
-
-    def close(self) -> None:
-        """Complete the file, and give it its name; a second call does nothing."""
-        if self._is_closed:
-            return
-        self._is_closed = True
-        with self._words(), self._files:
-            self._flush(self._pending_events)
-            self._finish()
+            planes.append(plane)
+        planes.stamps_us.append(microseconds)
 
     def _check(self, events: EventList) -> None:
-        first, last, size = int(events.t[0]), int(events.t[-1]), self._size
-        if first < self._last_us or (np.diff(events.t) < 0).any():
+        size, end_us = self._size, FORM_LIMITS[self._limit].end_us
+        if events.t[0] < self._last_us or (events.t[1:] < events.t[:-1]).any():
             raise UsageError(f"{self._path}: events step back behind {self._last_us} us: sort them; times begin at 0")
-        limit, form = FORM_LIMITS[EVENT_FORMS[self._form].limit], EVENT_FORMS[self._form].limit
-        if last >= limit.end_us:
+        if events.t[-1] >= end_us:
             raise UsageError(
-                f"{self._path}: an event at {last} us; {form} holds times below {limit.end_us} us: give a shorter "
-                "clip, or .h5 or .npz"
+                f"{self._path}: an event at {events.t[-1]} us; {self._limit} holds times below {end_us} us: give a "
+                "shorter clip, or .h5 or .npz"
             )
         x, y = int(events.x.max()), int(events.y.max())
         if x >= size.width or y >= size.height:
@@ -189,22 +178,6 @@ class EventWriter:
                 f"{size.height} px: correct its size"
             )
 
-    def _flush(self, count: int) -> None:
-        """Write the first ``count`` pending events."""
-        if not self._pending:
-            return
-        columns = {name: np.concatenate([getattr(each, name) for each in self._pending]) for name in "xytp"}
-
-        def part(first: int, last: int) -> EventList:
-            chosen = {name: column[first:last] for name, column in columns.items()}
-            return EventList(**chosen, width_px=self._size.width, height_px=self._size.height)
-
-        with self._words():
-            for first in range(0, count, EVENTS_AT_ONCE):
-                self._write(part(first, min(first + EVENTS_AT_ONCE, count)))
-        columns = {name: column[count:].copy() for name, column in columns.items()}  # a view would keep all of them
-        self._pending, self._pending_events = [part(0, len(columns["t"]))], len(columns["t"])
-
     @contextlib.contextmanager
     def _words(self) -> Iterator[None]:
         try:
@@ -212,28 +185,6 @@ class EventWriter:
                 yield
         except (OSError, RuntimeError) as error:  # the latter is faery's, for instance for a full disk
             raise UsageError(f"{self._path}: cannot be written: {getattr(error, 'strerror', None) or error}") from error
-
-    def _aside(self) -> Path:
-        return self._files.enter_context(write_aside_and_rename(self._path))
-
-    def _unnamed(self) -> IO[bytes]:
-        return self._files.enter_context(tempfile.TemporaryFile(dir=self._path.parent))
-
-    def _plane_file(self, name: str) -> IO[bytes]:
-        return self._unnamed()
-
-    def _plane_shape(self, axes: tuple[int, ...]) -> tuple[int, ...]:
-        return (*axes, self._size.height, self._size.width)
-
-    def _open(self) -> None:
-        raise NotImplementedError
-
-    def _write(self, events: EventList) -> None:
-        """Write a piece of EVENTS_AT_ONCE events; the last piece of a recording may be shorter."""
-        raise NotImplementedError
-
-    def _finish(self) -> None:
-        """Write what comes after the last event."""
 
 
 class _Rows:
@@ -245,216 +196,166 @@ class _Rows:
     """
 
     def __init__(self, file: IO[bytes], dtype: npt.DTypeLike, row: tuple[int, ...] = ()) -> None:
-        self.file, self.dtype, self.row, self.count = file, np.dtype(dtype), row, 0
+        self._file, self.dtype, self._row, self._count = file, np.dtype(dtype), row, 0
         self.finish()
         self._begin = file.tell()
 
     def append(self, rows: npt.ArrayLike) -> None:
-        array = np.asarray(rows, self.dtype).reshape(-1, *self.row)
-        self.file.write(np.ascontiguousarray(array).data)
-        self.count += len(array)
+        array = np.asarray(rows, self.dtype).reshape(-1, *self._row)
+        self._file.write(np.ascontiguousarray(array).data)
+        self._count += len(array)
 
     def finish(self) -> None:
         """Write the head, whose length does not depend on the number of rows."""
-        self.file.seek(0)
+        self._file.seek(0)
         head = {"descr": np.lib.format.dtype_to_descr(self.dtype), "fortran_order": False}
-        np.lib.format.write_array_header_1_0(self.file, head | {"shape": (self.count, *self.row)})
+        np.lib.format.write_array_header_1_0(self._file, head | {"shape": (self._count, *self._row)})
+
+    def copy_to(self, file: IO[bytes]) -> None:
+        """Copy all of it to another file."""
+        self.finish()
+        self._file.seek(0)
+        shutil.copyfileobj(self._file, file)
 
     def parts(self, rows: int) -> Iterator[npt.NDArray[Any]]:
         """Yield the rows again, in parts of this many."""
-        self.file.seek(self._begin)
-        row_bytes = self.dtype.itemsize * int(np.prod(self.row, dtype=np.int64))
-        while data := self.file.read(rows * row_bytes):
-            yield np.frombuffer(data, self.dtype).reshape(-1, *self.row)
+        self._file.seek(self._begin)
+        row_bytes = self.dtype.itemsize * int(np.prod(self._row, dtype=np.int64))
+        while data := self._file.read(rows * row_bytes):
+            yield np.frombuffer(data, self.dtype).reshape(-1, *self._row)
 
 
-class _Evt3(EventWriter):
-    def _open(self) -> None:
-        self._encoder, self._file = Encoder(), self._files.enter_context(self._aside().open("wb"))
-        self._file.write(header_of(self._size.width, self._size.height))
+class _Planes(_Rows):
+    """Pictures of a kind, in a file beside the recording, and when they are shown."""
 
-    def _write(self, events: EventList) -> None:
-        self._file.write(self._encoder.encode(_chunk(events)).tobytes())
+    def __init__(self, file: IO[bytes], kind: str, size: SensorSize) -> None:
+        dtype, axes = PLANES[kind]
+        super().__init__(file, dtype, (*axes, size.height, size.width) if axes else (size.height, size.width, 1))
+        self.stamps_us: list[int] = []
+
+    @property
+    def seconds(self) -> npt.NDArray[np.float64]:
+        """When they are shown, [N]."""
+        return np.array(self.stamps_us, np.float64) * 1e-6
 
 
-class _Faery(EventWriter):
-    """The forms that faery writes from an iterator of pieces, which wait in a file."""
+def _unnamed(path: Path) -> IO[bytes]:
+    return tempfile.TemporaryFile(dir=path.parent)
 
-    def _open(self) -> None:
-        self._faery = package("faery", str(self._path))
-        # The package knows a form by its ending.
-        aside = self._path.with_name(f".{self._path.stem}.{os.getpid()}.partial.{self._form}")
-        self._partial = self._files.enter_context(write_aside_and_rename(self._path, partial=aside))
-        self._partial.touch()  # before any work: whether it can be created
-        self._rows = _Rows(self._unnamed(), self._faery.EVENTS_DTYPE)
 
-    def _write(self, events: EventList) -> None:
-        table = np.empty(len(events), self._faery.EVENTS_DTYPE)
-        table["t"], table["x"], table["y"], table["on"] = events.t, events.x, events.y, events.p
-        self._rows.append(table)
+def _write_raw(path: Path, size: SensorSize, _: Mapping[str, _Planes]) -> _Written:
+    encoder = Encoder()
+    with write_aside_and_rename(path) as partial, partial.open("wb") as file:
+        file.write(header_of(size.width, size.height))
+        while piece := (yield):
+            file.write(encoder.encode(piece).data)
 
-    def _finish(self) -> None:
-        pieces = (piece.copy() for piece in self._rows.parts(EVENTS_AT_ONCE))  # faery writes into them
-        self._faery.file_encoder.events_to_file(
-            pieces, self._partial, (self._size.width, self._size.height), zero_t0=False,
-            file_type=self._form.strip("4"), use_write_suffix=False,
+
+def _write_by_faery(path: Path, size: SensorSize, _: Mapping[str, _Planes]) -> _Written:
+    faery = package("faery", str(path))
+    # The package knows a form by its ending, and takes its events from an iterator: they wait in a file.
+    aside = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix.lower()}")
+    with write_aside_and_rename(path, partial=aside) as partial, _unnamed(path) as file:
+        partial.touch()  # before any work: whether it can be created
+        rows = _Rows(file, faery.EVENTS_DTYPE)
+        while piece := (yield):
+            table = np.empty(len(piece), rows.dtype)
+            table["t"], table["x"], table["y"], table["on"] = piece.t_ns // 1000, piece.x, piece.y, piece.p
+            rows.append(table)
+        pieces = (part.copy() for part in rows.parts(EVENTS_AT_ONCE))  # faery writes into them
+        faery.file_encoder.events_to_file(
+            pieces, partial, (size.width, size.height), zero_t0=False, file_type=aside.suffix.strip(".4"),
+            use_write_suffix=False,
         )  # fmt: skip
 
 
-class _Columns(EventWriter):
-    """A file of NumPy for each column and kind of pictures, whose times are seconds."""
-
-    dtypes: ClassVar[Mapping[str, tuple[str, tuple[int, ...]]]] = {}
-
-    def _columns(self, events: EventList) -> tuple[npt.NDArray[Any], ...]:
-        raise NotImplementedError
-
-    def _column_file(self, name: str) -> IO[bytes]:
-        raise NotImplementedError
-
-    def _open(self) -> None:
-        self._target = self._new_target()
-        self._rows = {name: _Rows(self._column_file(name), *form) for name, form in self.dtypes.items()}
-
-    def _new_target(self) -> Path:
-        return self._aside()
-
-    def _plane_file(self, name: str) -> IO[bytes]:
-        return self._column_file(name)
-
-    def _plane_shape(self, axes: tuple[int, ...]) -> tuple[int, ...]:
-        return super()._plane_shape(axes) if axes else (*super()._plane_shape(axes), 1)
-
-    def _write(self, events: EventList) -> None:
-        for rows, values in zip(self._rows.values(), self._columns(events), strict=True):
-            rows.append(values)
-
-    def _all(self) -> dict[str, _Rows]:
-        """Return all arrays, complete, by name."""
-        found = {**self._rows, **self._planes}
-        for name, stamps in self._stamps.items():
-            found[f"{name}_ts"] = _Rows(self._column_file(f"{name}_ts"), "<f8")
-            found[f"{name}_ts"].append(np.array(stamps) * 1e-6)
-        for rows in found.values():
-            rows.finish()
-        return found
-
-
-class _Npz(_Columns):
-    dtypes: ClassVar = {"t": ("<i8", ()), "x": ("<u2", ()), "y": ("<u2", ()), "p": ("?", ())}
-
-    def _columns(self, events: EventList) -> tuple[npt.NDArray[Any], ...]:
-        return events.t, events.x, events.y, events.p
-
-    def _column_file(self, name: str) -> IO[bytes]:
-        return self._unnamed()
-
-    def _finish(self) -> None:
-        stated = {"width": np.int64(self._size.width), "height": np.int64(self._size.height), "note": np.array(_NOTE)}
-        with zipfile.ZipFile(self._target, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-            for name, rows in self._all().items():
-                rows.file.seek(0)
+def _write_npz(path: Path, size: SensorSize, planes: Mapping[str, _Planes]) -> _Written:
+    with write_aside_and_rename(path) as partial, contextlib.ExitStack() as files:
+        dtypes = {"t": "<i8", "x": "<u2", "y": "<u2", "p": "?"}
+        rows = {name: _Rows(files.enter_context(_unnamed(path)), dtype) for name, dtype in dtypes.items()}
+        while piece := (yield):
+            for each, values in zip(rows.values(), (piece.t_ns // 1000, piece.x, piece.y, piece.p), strict=True):
+                each.append(values)
+        stated: dict[str, npt.ArrayLike] = {f"{kind}_ts": each.seconds for kind, each in planes.items()}
+        stated |= {"width": np.int64(size.width), "height": np.int64(size.height), "note": np.array(_NOTE)}
+        with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+            for name, each in {**rows, **planes}.items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                    shutil.copyfileobj(rows.file, member)
+                    each.copy_to(member)
             for name, value in stated.items():
                 with archive.open(f"{name}.npy", "w") as member:
                     np.lib.format.write_array(member, np.asanyarray(value))
 
 
-class _Evreal(_Columns):
-    """EVREAL's folder; ``image_event_indices`` are the numbers of events before each picture."""
-
-    dtypes: ClassVar = {"events_ts": ("<f8", ()), "events_xy": ("<u2", (2,)), "events_p": ("?", ())}
-
-    def _columns(self, events: EventList) -> tuple[npt.NDArray[Any], ...]:
-        return events.t * 1e-6, np.stack([events.x, events.y], 1), events.p
-
-    def _column_file(self, name: str) -> IO[bytes]:
-        return self._files.enter_context((self._target / f"{name}.npy").open("wb+"))
-
-    def _new_target(self) -> Path:
-        cleanup, folder = self._files.enter_context(contextlib.ExitStack()), self._aside()
+def _write_evreal(path: Path, size: SensorSize, planes: Mapping[str, _Planes]) -> _Written:
+    """Write EVREAL's folder; ``image_event_indices`` are the numbers of events before each picture."""
+    with contextlib.ExitStack() as cleanup, write_aside_and_rename(path) as folder, contextlib.ExitStack() as files:
         cleanup.callback(shutil.rmtree, folder, ignore_errors=True)  # after a rename there is none
         folder.mkdir()
-        return folder
+        forms = {"events_ts": ("<f8", ()), "events_xy": ("<u2", (2,)), "events_p": ("?", ())}
+        rows = {
+            name: _Rows(files.enter_context((folder / f"{name}.npy").open("wb+")), *form)
+            for name, form in forms.items()
+        }
+        while piece := (yield):
+            columns = piece.t_ns // 1000 * 1e-6, np.stack([piece.x, piece.y], 1), piece.p
+            for each, values in zip(rows.values(), columns, strict=True):
+                each.append(values)
+        for each in rows.values():
+            each.finish()
+        for kind, each in planes.items():
+            with (folder / f"{kind}.npy").open("wb") as file:
+                each.copy_to(file)
+            np.save(folder / f"{kind}_ts.npy", each.seconds)
+        if "images" in planes:
+            earlier = np.zeros((len(planes["images"].seconds), 1), np.int64)
+            for part in rows["events_ts"].parts(EVENTS_AT_ONCE):
+                earlier[:, 0] += np.searchsorted(part, planes["images"].seconds)
+            np.save(folder / "image_event_indices.npy", earlier)
+        stated = {"sensor_resolution": [size.height, size.width], "note": _NOTE}
+        (folder / "metadata.json").write_text(json.dumps(stated) + "\n")
 
-    def _finish(self) -> None:
-        found = self._all()
-        if "images_ts" in found:
-            times = np.array(self._stamps["images"]) * 1e-6
-            earlier = np.zeros(len(times), np.int64)
-            for part in found["events_ts"].parts(EVENTS_AT_ONCE):
-                earlier += np.searchsorted(part, times)
-            indices = _Rows(self._column_file("image_event_indices"), "<i8", (1,))
-            indices.append(earlier)
-            indices.finish()
-        stated = {"sensor_resolution": [self._size.height, self._size.width], "note": _NOTE}
-        (self._target / "metadata.json").write_text(json.dumps(stated) + "\n")
 
+def _write_layout(path: Path, size: SensorSize, planes: Mapping[str, _Planes]) -> _Written:
+    """Write the h5 layout of E2VID's family and event_flow: :mod:`v2v_recordings.layout`."""
+    from v2v_recordings.layout_writer import RecordingWriter  # lazily: it loads h5py
 
-class _Layout(EventWriter):
-    """The h5 layout of E2VID's family and event_flow: :mod:`v2v_recordings.layout`."""
-
-    def _open(self) -> None:
-        from v2v_recordings.layout_writer import RecordingWriter  # lazily: it loads h5py
-
-        self._recording = self._files.enter_context(
-            RecordingWriter(self._path, source=self._source, size=self._size, origin_ns=0, pack_events=False)
-        )
-
-    def _write(self, events: EventList) -> None:
-        self._recording.add(_chunk(events))
-
-    def _finish(self) -> None:
-        for kind, rows in self._planes.items():
-            for number, (microseconds, part) in enumerate(zip(self._stamps[kind], rows.parts(1), strict=True)):
+    with RecordingWriter(path, source="v2v-simulate", size=size, origin_ns=0, pack_events=False) as recording:
+        while piece := (yield):
+            recording.add(piece)
+        for kind, each in planes.items():
+            for number, (microseconds, (plane,)) in enumerate(zip(each.stamps_us, each.parts(1), strict=True)):
                 if kind == "masks":
-                    self._recording.add_plane(f"masks/mask{number:09d}", 1000 * microseconds, part[0])
+                    recording.add_plane(f"masks/mask{number:09d}", 1000 * microseconds, plane[..., 0])
+                elif kind == "flow":
+                    recording.add(FlowField(1000 * microseconds, plane))
                 else:
-                    item = Picture if kind == "images" else FlowField
-                    self._recording.add(item(1000 * microseconds, part[0]))
+                    recording.add(Picture(1000 * microseconds, plane[..., 0]))
 
 
-class _Dsec(EventWriter):
-    """One file in DSEC's layout."""
+def _write_dsec(path: Path, size: SensorSize, _: Mapping[str, _Planes]) -> _Written:
+    """Write one file in DSEC's layout."""
+    from v2v_recordings.layout_writer import append, open_new  # lazily: it loads h5py
 
-    def _open(self) -> None:
-        from v2v_recordings.layout_writer import open_new  # lazily: it loads h5py
-
-        self._file, self._disk = self._files.enter_context(open_new(self._aside()))
-        self._file.attrs.update(width=self._size.width, height=self._size.height, note=_NOTE)
-        dtypes = {"x": "u2", "y": "u2", "t": "i8", "p": "u1"}
-        self._columns = {f"events/{name}": self._appendable(f"events/{name}", dtype) for name, dtype in dtypes.items()}
-        self._first_of_ms = self._appendable("ms_to_idx", "u8")
-        self._written = 0
-
-    def _appendable(self, name: str, dtype: str) -> Any:
-        return self._file.create_dataset(
-            name, (0,), dtype, maxshape=(None,), chunks=(EVENTS_AT_ONCE,), compression="gzip", compression_opts=1
-        )
-
-    def _write(self, events: EventList) -> None:
-        self._disk.check()
-        first_ms, last_ms = len(self._first_of_ms), int(events.t[-1]) // 1000
-        begins = self._written + np.searchsorted(events.t, np.arange(first_ms, last_ms + 1) * 1000)
-        _append(self._first_of_ms, begins)
-        for name, column in self._columns.items():
-            _append(column, getattr(events, name[-1]))
-        self._written += len(events)
-
-    def _finish(self) -> None:
-        _append(self._first_of_ms, [self._written] * (1 if self._written else 2))
-        self._file["t_offset"] = np.int64(0)
-
-
-def _append(dataset: Any, values: npt.ArrayLike) -> None:
-    count, values = len(dataset), np.asarray(values)
-    dataset.resize(count + len(values), axis=0)
-    dataset[count:] = values
-
-
-def _chunk(events: EventList) -> EventChunk:
-    return EventChunk(events.t * 1000, events.x, events.y, events.p)
+    with write_aside_and_rename(path) as partial, open_new(partial) as (file, disk):
+        file.attrs.update(width=size.width, height=size.height, note=_NOTE)
+        dtypes = {"events/x": "u2", "events/y": "u2", "events/t": "i8", "events/p": "u1", "ms_to_idx": "u8"}
+        packed = {"compression": "gzip", "compression_opts": 1}
+        columns = [
+            file.create_dataset(name, (0,), dtype, maxshape=(None,), chunks=(EVENTS_AT_ONCE,), **packed)
+            for name, dtype in dtypes.items()
+        ]
+        first_of_ms, written = columns[-1], 0
+        while piece := (yield):
+            disk.check()
+            t_us = piece.t_ns // 1000
+            next_ms = 1000 * np.arange(len(first_of_ms), int(t_us[-1]) // 1000 + 1)
+            values = piece.x, piece.y, t_us, piece.p, written + np.searchsorted(t_us, next_ms)
+            for column, added in zip(columns, values, strict=True):
+                append(column, added)
+            written += len(piece)
+        append(first_of_ms, np.full(1 if written else 2, written))
+        file["t_offset"] = np.int64(0)
 
 
 class EventForm(NamedTuple):
@@ -462,20 +363,20 @@ class EventForm(NamedTuple):
 
     ending: str
     limit: str
-    writer: type[EventWriter]
+    write: Callable[[Path, SensorSize, Mapping[str, _Planes]], _Written]
     package: str = ""
     planes: tuple[str, ...] = ()
 
 
 EVENT_FORMS = {
-    "h5": EventForm(".h5", "E2VID's layout", _Layout, "h5py", tuple(PLANES)),
-    "dsec": EventForm(".h5", "DSEC's layout", _Dsec, "h5py"),
-    "npz": EventForm(".npz", "npz", _Npz, planes=tuple(PLANES)),
-    "raw": EventForm(".raw", "EVT 3", _Evt3),
-    "aedat4": EventForm(".aedat4", "AEDAT 4", _Faery, "faery"),
-    "es": EventForm(".es", "Event Stream", _Faery, "faery"),
-    "dat": EventForm(".dat", "DAT", _Faery, "faery"),
-    "evreal": EventForm("", "EVREAL's layout", _Evreal, planes=tuple(PLANES)),
+    "h5": EventForm(".h5", "E2VID's layout", _write_layout, "h5py", tuple(PLANES)),
+    "dsec": EventForm(".h5", "DSEC's layout", _write_dsec, "h5py"),
+    "npz": EventForm(".npz", "npz", _write_npz, planes=tuple(PLANES)),
+    "raw": EventForm(".raw", "EVT 3", _write_raw),
+    "aedat4": EventForm(".aedat4", "AEDAT 4", _write_by_faery, "faery"),
+    "es": EventForm(".es", "Event Stream", _write_by_faery, "faery"),
+    "dat": EventForm(".dat", "DAT", _write_by_faery, "faery"),
+    "evreal": EventForm("", "EVREAL's layout", _write_evreal, planes=tuple(PLANES)),
 }
 """Forms by the name that commands take."""
 ENDINGS = {

@@ -15,11 +15,11 @@ from v2v_protocol.errors import SampleUnavailable, UsageError, V2VError
 from v2v_protocol.programs import counted, show
 from v2v_protocol.progress import Progress
 from v2v_protocol.spec_flags import add_spec
-from v2v_protocol.write_aside import make_output_folder, write_file
+from v2v_protocol.write_aside import write_file
 from v2v_recordings.writers import EVENT_FORMS, check_form, open_writer
 from v2v_server.worker.making.make import list_sample_events, span_ends_us
 from v2v_tools.remake import RemadeSample
-from v2v_tools.sample_flags import add_samples, asked_remaker, asked_spec
+from v2v_tools.sample_flags import add_folder, add_samples, asked_remaker, asked_spec, make_folder
 
 _PLANES = {"frames": "images", "flow": "flow", "masks": "masks"}
 """What a recording calls the arrays that it can hold."""
@@ -36,10 +36,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         ],
     )  # fmt: skip
     add_samples(parser)
-    out = parser.group("Output")
-    out.add_argument("--count", type=int, required=True, metavar="N", help="number of samples, from --index on")
-    out.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for SEED-EPOCH-INDEX and its .json")
-    out.add_argument("--events", default="h5", choices=tuple(EVENT_FORMS), help="form of a recording (default h5)")
+    out = add_folder(parser, "SEED-EPOCH-INDEX and its .json", "h5")
+    out.add_argument(
+        "--count", type=int, required=True, metavar="N",
+        help="number of samples, from --index on; the next epochs follow",
+    )  # fmt: skip
     out.add_argument(
         "--arrays", metavar="NAME,NAME",
         help=f"of {', '.join(_PLANES)} (default frames if the form holds pictures, else none)",
@@ -58,22 +59,21 @@ def _run(asked: argparse.Namespace) -> int | None:
     if unknown := [name for name in arrays if name not in _PLANES]:
         raise UsageError(f"--arrays {','.join(unknown)}: a recording holds {', '.join(_PLANES)}; give some of these")
     check_form(asked.out / "sample", asked.events, spec.recipe.crop_px[::-1], [_PLANES[name] for name in arrays])
+    if asked.count < 1:
+        raise UsageError(f"--count {asked.count}: give a whole number from 1")
     remaker = asked_remaker(asked, spec, arrays or ("frames",))
-    last = asked.index + asked.count
-    if asked.count < 1 or last > remaker.count:
-        most = f"the epoch has {counted(remaker.count, 'sample')}, and --index {asked.index} is the first one to write"
-        raise UsageError(f"--count {asked.count}: {most}; give a number from 1 to {remaker.count - asked.index}")
-    try:
-        make_output_folder(asked.out)
-    except OSError as error:
-        raise UsageError(f"--out {asked.out}: cannot be written: {error.strerror}") from error
+    if not 0 <= asked.index < remaker.count:
+        raise UsageError(f"--index {asked.index}: the epoch has {counted(remaker.count, 'sample')}, from 0 on")
+    make_folder(asked.out)
     failed = events = 0
-    with Progress("writing samples") as progress:
-        for done, index in enumerate(range(asked.index, last)):
+    with Progress("writing samples", "samples") as progress:
+        for done in range(asked.count):
             progress(done, asked.count)
-            path = asked.out / f"{asked.seed}-{asked.epoch}-{index}{form.ending}"
+            later, index = divmod(asked.index + done, remaker.count)
+            epoch = asked.epoch + later
+            path = asked.out / f"{asked.seed}-{epoch}-{index}{form.ending}"
             try:
-                remade = remaker.made(asked.seed, asked.epoch, index)
+                remade = remaker.made(asked.seed, epoch, index)
             except SampleUnavailable as error:
                 progress.notice(f"{path} is left out: {error}")
                 failed += 1

@@ -19,20 +19,19 @@ from v2v_protocol.programs import counted, show
 from v2v_protocol.progress import Progress
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import add_spec
-from v2v_protocol.write_aside import check_outside, make_output_folder, write_file
+from v2v_protocol.write_aside import check_outside, write_file
 from v2v_recordings.writers import EVENT_FORMS, check_form, open_writer
 from v2v_server.broker.leases import Request
-from v2v_server.config import ServeConfig
 from v2v_server.corpus.catalogue import Catalogue
 from v2v_server.corpus.sources.source import VideoSource
-from v2v_server.kinds.registry import KindFlags, kind_from
+from v2v_server.kinds.registry import kind_from
 from v2v_server.schedule import VideoSequence
 from v2v_server.simulation.continued import ContinuedClip, part_of
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.system.isolate import Died, run_isolated
 from v2v_server.worker.making.make import simulate
-from v2v_tools.remake import lease_for, open_shown
-from v2v_tools.sample_flags import asked_spec
+from v2v_tools.remake import lease_for
+from v2v_tools.sample_flags import add_corpus, add_folder, asked_catalogue, asked_spec, make_folder
 from v2v_tools.whole_clip import WholeClip, spec_of_whole
 
 _PLANES = ("images",)
@@ -84,16 +83,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             "v2v-simulate --whole videos/ --out events/ --events raw --recipe davis346 --jobs 4",
         ],
     )  # fmt: skip
-    which = parser.group("Which videos")
+    which = add_corpus(parser, "Which videos", "a video, a folder of videos, or a list file")
     which.add_argument("--whole", action="store_true", required=True, help="make events of whole videos")
-    which.add_argument("video", metavar="VIDEO", help="a video, a folder of videos, or a list file")
-    which.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the cameras (default 0)")
-    which.add_argument("--epoch", type=int, default=0, metavar="N", help="another camera for each video (default 0)")
-    parser.add_settings(ServeConfig, "list", "rows", "cache_dir")
-    parser.add_settings(KindFlags)
-    out = parser.group("Output")
-    out.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the recordings")
-    out.add_argument("--events", choices=tuple(EVENT_FORMS), required=True, help="form of the recordings")
+    out = add_folder(parser, "the recordings")
     out.add_argument("--frames", action="store_true", help="also write the frames as the camera sees them")
     out.add_argument("--jobs", type=int, default=1, metavar="N", help="videos at a time (default 1)")
     add_spec(parser)
@@ -106,22 +98,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(asked: argparse.Namespace) -> int:
     """Make a recording of each video that has none; return the exit status."""
     spec = asked_spec(asked)
-    kind = kind_from(vars(asked))
-    if kind.is_view:
-        raise UsageError("--whole with photographs: each sample has a path of its own; use --index without --whole")
+    if kind_from(vars(asked)).is_view:
+        raise UsageError(
+            "--whole with photographs: a photograph has no length, and its motion is drawn for each sample; write "
+            "samples of them with --count N, as long as --set voxels_per_clip=N says"
+        )
     if asked.jobs < 1:
         raise UsageError(f"--jobs {asked.jobs}: give a whole number from 1")
     check_outside("--out", asked.out, filter(None, (asked.video, asked.list)))
-    catalogue = open_shown(
-        asked.video, list_file=asked.list, rows=asked.rows or "full", scene=spec.scene != "off",
-        cache_dir=asked.cache_dir, kind=kind,
-    )  # fmt: skip
-    for refusal in catalogue.refusals:
-        show(f"cannot be used: {refusal}")
-    try:
-        make_output_folder(asked.out)
-    except OSError as error:
-        raise UsageError(f"--out {asked.out}: {error.strerror}") from error
+    catalogue = asked_catalogue(asked, spec)
+    make_folder(asked.out)
     failed, jobs = len(catalogue.refusals), list[WholeVideo]()
     for rank in range(len(catalogue.videos)):
         try:
@@ -232,7 +218,7 @@ def make_recording(source: VideoSource, job: WholeVideo, advance: Callable[[int]
     """
     clip = WholeClip(job.lease)
     job.path.parent.mkdir(parents=True, exist_ok=True)
-    camera, events = ContinuedClip(), 0
+    camera = ContinuedClip()
     with open_writer(job.path, job.form, clip.size, _PLANES if job.has_frames else ()) as writer:
         for first, context in clip.parts(source):
             last = first + len(context.view) - 1
@@ -248,10 +234,9 @@ def make_recording(source: VideoSource, job: WholeVideo, advance: Callable[[int]
                 part = part_of(given, begin - first, end - first)
                 for found in camera.events(part, clip.since_us[begin : end + 1]):
                     writer.add(found)
-                    events += len(found)
             advance(last - first + (first == 0))
     record = _identity(job) | {
-        "params": context.params.to_dict(), "frames": job.frames, "events": events, "remark": job.lease.remark
+        "params": context.params.to_dict(), "frames": job.frames, "events": writer.events, "remark": job.lease.remark
     }  # fmt: skip
     write_file(job.note, json.dumps(record, indent=1) + "\n")
-    return Outcome(events, job.frames)
+    return Outcome(writer.events, job.frames)

@@ -68,11 +68,19 @@ def test_the_events_of_a_set_counted_in_bins_are_the_samples_of_the_stream(
         assert voxels.any()
 
 
+def test_after_the_last_sample_of_an_epoch_comes_the_next_epoch(videos: Path, tmp_path: Path) -> None:
+    out, spec = tmp_path / "set", StreamSpec.from_dict({"recipe": RECIPE})
+    last = Remaker(open_catalogue(str(videos)), spec).count - 1
+    line = [str(videos), "--count", "2", "--out", str(out), "--cache-dir", str(tmp_path), "--epoch", "4", *SETTINGS]
+    assert command.main([*line, "--index", str(last), "--events", "raw"]) == 0
+    assert {path.name for path in out.glob("*.raw")} == {f"0-4-{last}.raw", "0-5-0.raw"}
+
+
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        (["--count", "0"], "--count 0: the epoch has "),
-        (["--count", "9999"], "give a number from 1 to "),
+        (["--count", "0"], "--count 0: give a whole number from 1"),
+        (["--count", "1", "--index", "9999"], "--index 9999: the epoch has "),
         (["--count", "1", "--arrays", "voxels"], "--arrays voxels: a recording holds frames, flow, masks; give some"),
         (["--count", "1", "--events", "raw", "--arrays", "frames"], "raw holds no images; give another form: h5, npz"),
         (["--count=1", "--events", "raw", "--set", "crop_width_px=2049"], "EVT 3 holds at most 2048 px a side"),

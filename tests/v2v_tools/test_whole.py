@@ -160,3 +160,5 @@ def test_what_gives_no_events_is_named(tmp_path: Path, capfd: Any) -> None:
     assert "it lies in" in capfd.readouterr().err
     assert simulate(tmp_path / "videos", tmp_path / "out", "--jobs", "0") == 2
     assert "--jobs 0: give a whole number from 1" in capfd.readouterr().err
+    assert simulate(tmp_path / "videos", tmp_path / "out", "--videos-kind", "photographs") == 2
+    assert "a photograph has no length" in capfd.readouterr().err

@@ -11,11 +11,10 @@ from v2v_protocol.events import EventList
 from v2v_server.simulation.effects.kernel import ROWS
 from v2v_server.simulation.kernels import Carried, KernelInput, list_piece
 from v2v_server.simulation.precision import Real
-from v2v_server.simulation.representations.listing import new_rows
 from v2v_server.simulation.voxel import Doubles, Levels, Moments, bin_edges
 
 PIECE_EVENTS = 1 << 21
-"""Events of a piece, unless a single step has more: 64 MiB to list and sort them."""
+"""Events of a piece, unless a single step has more: 48 MiB to list and sort them."""
 _FULL = 0.8
 """Part of them that the next piece should have, if its steps fire as often as those of the last one."""
 
@@ -29,7 +28,7 @@ class ContinuedClip:
     """
 
     def __init__(self, real: Real = np.float64, most_events: int = PIECE_EVENTS) -> None:
-        self._real, self._rows = real, new_rows(most_events)
+        self._real, self._rows = real, np.empty((most_events, 2), np.int64)
         self._carried: Carried | None = None
         self._steps_at_once = 1
 
@@ -57,11 +56,11 @@ class ContinuedClip:
             count, events = list_piece(
                 piece, self._real, np.diff(since_us[first : last + 1]), since_us[first : last + 1], self._rows
             )
-            most = len(self._rows.own)
+            most = len(self._rows)
             self._steps_at_once = max(1, min(int(_FULL * most * (last - first) / max(count, 1)), 2 * (last - first)))
             if count > most:
                 if last - first == 1:
-                    self._rows = new_rows(count)
+                    self._rows = np.empty((count, 2), np.int64)
                 continue
             self._carried = Carried(
                 carried.after, carried.before, carried.steps + last - first, carried.segments + piece.segments, True

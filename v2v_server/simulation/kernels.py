@@ -24,7 +24,7 @@ from v2v_server.simulation.intensity import Intensity, fine_table, log_table, lo
 from v2v_server.simulation.pixel import hot_pixels, simulate_pixels
 from v2v_server.simulation.precision import Real
 from v2v_server.simulation.representations import NAMES, REPRESENTATIONS, fill_array, new_memory
-from v2v_server.simulation.representations.listing import EventRows, Listing, columns_in_order, new_rows
+from v2v_server.simulation.representations.listing import Listing, columns_in_order
 from v2v_server.simulation.voxel import (
     LARGEST_COUNT,
     Doubles,
@@ -39,7 +39,7 @@ from v2v_server.simulation.voxel import (
     timeline,
 )
 
-_NO_LIST = Listing(new_rows(0).own, *np.empty((2, 0)), *np.empty((2, 0), np.int64))
+_NO_LIST = Listing(np.empty((0, 2), np.int64), *np.empty((2, 0)), *np.empty((2, 0), np.int64))
 
 
 class Carried(NamedTuple):
@@ -175,19 +175,19 @@ def list_events(given: KernelInput, real: Real, step_us: Doubles) -> EventList:
     """
     check_duration(float(step_us.sum()))
     since_us = frame_times(step_us)
-    count, _ = list_piece(given, real, step_us, since_us, new_rows(1))
-    return list_piece(given, real, step_us, since_us, new_rows(count))[1]
+    count, _ = list_piece(given, real, step_us, since_us, np.empty((1, 2), np.int64))
+    return list_piece(given, real, step_us, since_us, np.empty((count, 2), np.int64))[1]
 
 
 def list_piece(
-    given: KernelInput, real: Real, step_us: Doubles, since_us: Doubles, rows: EventRows
+    given: KernelInput, real: Real, step_us: Doubles, since_us: Doubles, rows: Longs
 ) -> tuple[int, EventList]:
     """List the events of a piece of a clip, see :func:`list_events`.
 
     Args:
         given, real, step_us: see :func:`list_events`.
         since_us: [steps + 1] time of each frame, microseconds, at least 0.
-        rows: memory for the events.
+        rows: [capacity, 2] int64, memory for the events.
 
     Returns:
         the number of events, and the events; not all of them if there are more than ``rows`` can hold.
@@ -195,15 +195,12 @@ def list_piece(
     general = _General(given, real)
     part, first_us = general.timeline, whole_edges(time_of(given.edges, step_us, since_us))
     listing = Listing(
-        rows.own, time_of(Moments(part.step, part.start), step_us, since_us), part.share * step_us[part.step],
+        rows, time_of(Moments(part.step, part.start), step_us, since_us), part.share * step_us[part.step],
         first_us[part.bin], first_us[part.bin + 1] - 1,
     )  # fmt: skip
     count = general.run({}, listing)["listing"]
     _, height, width = given.frames.shape
-    listed = min(count, len(rows.own))
-    place, t, p = np.empty((2, listed), np.uint16), np.empty(listed, np.int64), np.empty(listed, np.bool_)
-    columns_in_order(rows.own[:listed], rows.spare[:listed], width, place, t, p)
-    return count, EventList(place[0], place[1], t, p, width, height)
+    return count, EventList(*columns_in_order(rows[:count], width), width, height)
 
 
 @dataclass(frozen=True, slots=True, repr=False, eq=False)

@@ -12,6 +12,7 @@ instruction set changes the speed, never a bit.
 # mypy: allow-untyped-defs, allow-untyped-calls
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numba
@@ -120,8 +121,9 @@ def hot_pixels(key: noise.NoiseKey, count: int, pixels: int) -> tuple[npt.NDArra
     return position, normal
 
 
+@lru_cache(maxsize=4)  # each piece of a long clip asks again
 def smallest_words(key: noise.NoiseKey, purpose: int, count: int, pixels: int) -> npt.NDArray[np.int64]:
-    """Return the pixels that have the smallest words: [count] int64, ascending, in row order."""
+    """Return the pixels that have the smallest words: [count] int64, ascending, in row order; not to be changed."""
     if count == 0:
         return np.empty(0, np.int64)
     place_words = words(key, purpose, np.arange(pixels))

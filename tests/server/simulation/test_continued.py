@@ -15,7 +15,7 @@ from v2v_protocol.events import EventList
 from v2v_server.simulation import simulate
 from v2v_server.simulation.continued import ContinuedClip
 from v2v_server.simulation.kernels import KernelInput, list_events
-from v2v_server.simulation.representations.listing import columns_in_order, new_rows
+from v2v_server.simulation.representations.listing import columns_in_order
 from v2v_server.simulation.voxel import Levels, Moments
 
 STEPS = 12
@@ -102,13 +102,12 @@ def test_after_a_restart_pixels_forget_what_they_saw() -> None:
 )
 def test_events_are_sorted_by_time_and_pixel_and_equal_ones_stay(data: Any, count: int, start: int, span: int) -> None:
     random = np.random.default_rng(data.draw(st.integers(0, 2**32)))
-    rows = new_rows(count)
-    rows.own[:, 0] = start + random.integers(0, span, count, endpoint=True)
-    rows.own[:, 1] = random.integers(0, 2 * 7 * 3, count)
-    t, code = rows.own.T.copy()
+    rows = np.empty((count, 2), np.int64)
+    rows[:, 0] = start + random.integers(0, span, count, endpoint=True)
+    rows[:, 1] = random.integers(0, 2 * 7 * 3, count)
+    t, code = rows.T.copy()
     order = np.lexsort((code >> 1, t))
-    place, found_t, p = np.empty((2, count), np.uint16), np.empty(count, np.int64), np.empty(count, np.bool_)
-    columns_in_order(rows.own, rows.spare, 7, place, found_t, p)
+    x, y, found_t, p = columns_in_order(rows, 7)
     np.testing.assert_array_equal(found_t, t[order])
-    np.testing.assert_array_equal(place[0] + 7 * place[1].astype(np.int64), code[order] >> 1)
+    np.testing.assert_array_equal(x + 7 * y.astype(np.int64), code[order] >> 1)
     np.testing.assert_array_equal(p, code[order] % 2 == 1)

@@ -303,7 +303,12 @@ def _time(each, number, block, old, first, last, folds, made, clipped):
         old: [block] real, the residual at its start.
         folds: of the noise's words for these times.
     """
-    for i in range(last - first):
+    found, count = block.words[0], 0
+    for pixel in range(last - first):  # without a branch: most pixels have no events
+        found[count] = pixel
+        count += block.rises[pixel] + block.falls[pixel] > 0
+    for place in range(count):
+        i = np.int64(found[place])
         for is_rising in range(2):
             events = int(block.rises[i] if is_rising else block.falls[i])
             if events == 0:

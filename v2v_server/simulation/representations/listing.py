@@ -7,18 +7,12 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+import numpy.typing as npt
 
 from v2v_server.simulation.effects.state import hook
 
-_DIGIT_BITS = 16
-"""Bits of a time that one pass of the sort looks at; its counters then fit into a core's cache."""
-
-
-class EventRows(NamedTuple):
-    """Memory for events, [capacity, 2] int64, and as much again for the sort."""
-
-    own: Any
-    spare: Any
+_WORD_BITS, _DIGIT_BITS = 63, 11
+"""Bits of a word of the sort, and how many of a time one pass looks at."""
 
 
 class Listing(NamedTuple):
@@ -35,11 +29,6 @@ class Listing(NamedTuple):
     span_us: Any
     first_us: Any
     last_us: Any
-
-
-def new_rows(capacity: int) -> EventRows:
-    """Return memory for events."""
-    return EventRows(np.empty((capacity, 2), np.int64), np.empty((capacity, 2), np.int64))
 
 
 def prepare(memory, given, segments, real):
@@ -66,52 +55,62 @@ def events(tables, train):
     return 0
 
 
-@numba.njit(nogil=True, cache=True)
-def columns_in_order(rows, spare, width, place, t, p):
-    """Sort events by time, those of a microsecond by pixel, and write their columns; equal ones stay in their order.
+def columns_in_order(rows: npt.NDArray[np.int64], width: int) -> tuple[Any, Any, Any, Any]:
+    """Return x, y, t and p of events by time, those of a microsecond by pixel; equal ones stay in their order.
 
     Args:
-        rows: [n, 2] int64, as listed; changed, as is ``spare``, [n, 2] int64.
+        rows: [n, 2] int64, as listed; changed.
         width: of the picture, px.
-        place: [2, n] uint16, x and y; ``t``: [n] int64; ``p``: [n] bool; all written.
+
+    Returns:
+        [n] uint16, uint16, int64 and bool.
     """
-    if len(rows) == 0:
-        return
-    first, last = rows[0, 0], rows[0, 0]
+    count = len(rows)
+    (x, y), t, p = np.empty((2, count), np.uint16), np.empty(count, np.int64), np.empty(count, np.bool_)
+    if count:
+        times, codes = rows.T
+        first = int(times.min())
+        code_bits, time_bits = (int(codes.max()) | 1).bit_length(), (int(times.max()) - first).bit_length()
+        if code_bits + time_bits < _WORD_BITS:
+            _columns_of_words(rows, first, code_bits, time_bits, np.uint32(width), x, y, t, p)
+        else:
+            t[:], codes = rows[np.lexsort((codes >> 1, times))].T
+            y[:], x[:], p[:] = (codes >> 1) // width, (codes >> 1) % width, codes & 1
+    return x, y, t, p
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _columns_of_words(rows, first, code_bits, time_bits, width, x, y, t, p):
+    """Write the columns; the sort sees an event as one word, with its time after ``first`` in the upper bits."""
+    passes = -(-time_bits // _DIGIT_BITS)
+    digit = -(-time_bits // max(passes, 1))
+    words, mask = np.empty(len(rows), np.int64), (1 << digit) - 1
+    ends = np.zeros((max(passes, 1), (1 << digit) + 1), np.int64)
     for i in range(len(rows)):
-        first, last = min(first, rows[i, 0]), max(last, rows[i, 0])
-    bits = 0
-    while (last - first) >> bits > 0:
-        bits += 1
-    passes = -(-bits // _DIGIT_BITS)
-    digit = -(-bits // max(passes, 1))
+        time = rows[i, 0] - first
+        words[i] = time << code_bits | rows[i, 1]
+        for number in range(passes):
+            ends[number, (time >> number * digit & mask) + 1] += 1
+    other = rows.reshape(-1)[: len(rows)]
     for number in range(passes):
-        shift, mask = number * digit, (1 << digit) - 1
-        ends = np.zeros((1 << digit) + 1, np.int64)
-        for i in range(len(rows)):
-            ends[((rows[i, 0] - first) >> shift & mask) + 1] += 1
+        shift = code_bits + number * digit
         for value in range(1 << digit):
-            ends[value + 1] += ends[value]
-        for i in range(len(rows)):
-            value = (rows[i, 0] - first) >> shift & mask
-            spare[ends[value], 0], spare[ends[value], 1] = rows[i, 0], rows[i, 1]
-            ends[value] += 1
-        rows, spare = spare, rows
-    begin = 0
-    for i in range(1, len(rows) + 1):
-        if i == len(rows) or rows[i, 0] != rows[begin, 0]:
-            _order_pixels(rows[begin:i, 1])
-            begin = i
-    for i in range(len(rows)):
-        code = rows[i, 1]
-        place[1, i], place[0, i] = (code >> 1) // width, (code >> 1) % width
-        t[i], p[i] = rows[i, 0], code & 1 == 1
-
-
-@numba.njit(nogil=True, cache=True)
-def _order_pixels(codes):
-    """Sort the events of one microsecond by pixel. They are in order, apart from a microsecond in two segments."""
-    for i in range(1, len(codes)):
-        if codes[i] >> 1 < codes[i - 1] >> 1:
-            codes[:] = codes[np.argsort(codes >> 1, kind="mergesort")]
-            return
+            ends[number, value + 1] += ends[number, value]
+        for i in range(len(words)):
+            value = words[i] >> shift & mask
+            other[ends[number, value]] = words[i]
+            ends[number, value] += 1
+        words, other = other, words
+    for i in range(1, len(words)):
+        if words[i] >> 1 < words[i - 1] >> 1:  # a microsecond in two segments
+            begin, end, time = i - 1, i + 1, words[i] >> code_bits
+            while begin > 0 and words[begin - 1] >> code_bits == time:
+                begin -= 1
+            while end < len(words) and words[end] >> code_bits == time:
+                end += 1
+            words[begin:end] = words[begin:end][np.argsort(words[begin:end] >> 1, kind="mergesort")]
+    for i in range(len(words)):
+        pixel = np.uint32((words[i] & ((1 << code_bits) - 1)) >> 1)
+        row = np.uint32(pixel // width)
+        y[i], x[i] = row, pixel - row * width
+        t[i], p[i] = first + (words[i] >> code_bits), words[i] & 1 == 1
