@@ -64,13 +64,11 @@ class Worst(NamedTuple):
     Attributes:
         smallest, largest: limits of the pixel's thresholds, as multiples of the nominal ones.
         change: what is added to the changes of log intensity, summed over the clip, in thresholds of the pixel.
-        legs: parts of a step that are compared with the thresholds one after another.
     """
 
     smallest: float = 1.0
     largest: float = 1.0
     change: float = 0.0
-    legs: float = 1.0
 
 
 def worst_of(effects: Mapping[str, Collection[float]], steps: int, seconds: float) -> Worst:
@@ -89,7 +87,6 @@ def worst_of(effects: Mapping[str, Collection[float]], steps: int, seconds: floa
         math.prod(min(case.smallest for case in each) for each in cases),
         math.prod(max(case.largest for case in each) for each in cases),
         sum(max(case.change for case in each) for each in cases),
-        max((case.legs for each in cases for case in each), default=1.0),
     )
 
 
@@ -109,9 +106,9 @@ def most_events(
         noise_sum: standard deviations of noise and of hot drift, summed over the steps, log units.
         worst: what the effects do, the values of a :class:`Worst`; without them, nothing.
     """
-    (low, high), (least, most, added, legs) = log_ends, Worst(*worst)
+    (low, high), (least, most, added) = log_ends, Worst(*worst)
     largest = max(thresholds) * most
-    change = (steps * legs + 1) * (largest + (high - low)) + LARGEST_NORMAL * (noise_sum + added * largest)
+    change = (steps + 1) * (largest + (high - low)) + LARGEST_NORMAL * (noise_sum + added * largest)
     return (change + max(abs(low), abs(high))) / (min(thresholds) * least)
 
 
@@ -435,7 +432,7 @@ class Recipe(Persisted):
     noise_band_share: Range = span(
         (0.0, 0.0), 0.0, 10.0, "standard deviation of noise below noise_band_hz, as a share of the mean threshold",
         is_later=True, usual=(0.0, 0.4), mistake="Still pixels would fire without a pause. Divide percent by 100.",
-        worst=lambda share, steps, _: Worst(change=8.0 * share * steps, legs=3.0 if share else 1.0),
+        worst=lambda share, steps, _: Worst(change=8.0 * share * steps),
     )  # fmt: skip
     noise_band_hz: Range = span(
         (0.0, 0.0), 0.01, 1e4, "corner frequency of the noise of noise_band_share", unit="Hz", off=True, is_later=True,

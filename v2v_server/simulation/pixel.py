@@ -143,6 +143,15 @@ def minus_two_ln(word):
     return log + fraction * ((_L0 + _L1 * fraction) + high * square)
 
 
+@numba.njit(nogil=True)
+def half_mixed(x):
+    """Return the first half of ``noise.mix`` of a word, uint32."""
+    x = np.uint32(x ^ (x >> np.uint32(16)))
+    x = np.uint32(x * _M0)
+    x = np.uint32(x ^ (x >> np.uint32(15)))
+    return np.uint32(x * _M1)
+
+
 @numba.njit(nogil=True, inline="always")
 def two_normals(radius_words, angle_words, radius_word, angle_word, x_row, y_row, radius_row, normal):
     """Write ``noise.mix`` and ``noise.box_muller`` of a block to ``normal`` [2, block], using the three other rows.
@@ -151,11 +160,7 @@ def two_normals(radius_words, angle_words, radius_word, angle_word, x_row, y_row
     chain of dependent operations fills that window with a single iteration.
     """
     for i in range(PIXELS_A_BLOCK):
-        x = np.uint32(radius_words[i] ^ radius_word)
-        x = np.uint32(x ^ (x >> np.uint32(16)))
-        x = np.uint32(x * _M0)
-        x = np.uint32(x ^ (x >> np.uint32(15)))
-        x = np.uint32(x * _M1)
+        x = half_mixed(np.uint32(radius_words[i] ^ radius_word))
         y = np.uint32(np.uint32(x ^ (x >> np.uint32(15))) ^ np.uint32(angle_words[i] ^ angle_word))
         x_row[i] = np.uint32((x & _LOW_31_BITS) | np.uint32(1))
         y_row[i] = np.uint32(y * _M2)

@@ -27,7 +27,8 @@ and, compiled, any of these functions. Each does nothing if the tables say off:
     change(tables, own, block, at)    may add to ``block.change``
     divide(tables, own, block, at)    may divide the step into legs, ``block.legs`` and ``block.shares``; then it
                                       returns True
-    cross(tables, own, block, at)     may decide ``block.signed`` and ``block.residual`` itself; then it returns True
+    cross(tables, own, block, at)     may decide ``block.residual`` and the events itself: ``block.rises``,
+                                      ``block.falls`` and, for their times, ``block.signed``; then it returns True
     after(tables, own, block, at)     may change ``block.rises`` and ``block.falls``, the events, and ``block.residual``
 
 Within a step: see, noise, change, hot drift, divide; then, once or for each leg, cross and after. Effects run in the

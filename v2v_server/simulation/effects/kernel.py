@@ -37,7 +37,7 @@ _UNIT, _WHOLE = np.float32(2.0**-24), np.float32(1)
 _FIRST_ROW = (0, *accumulate(effect.ROWS for effect in EFFECTS))
 ROWS = _FIRST_ROW[-1]
 """Rows of a block's state that the effects need."""
-_OWN = 18 + 2 * LEGS
+_OWN = 17 + LEGS
 _CARRIED = (0, *range(_OWN, _OWN + ROWS))
 """Rows of a block's state that outlive a clip: the residual, and those of the effects."""
 FIXED, UNIFORM, TRIANGULAR = range(3)
@@ -134,12 +134,12 @@ def _simulate(
     # One by one: rows that are unpacked from an array have unknown strides, and their loops are not vectorised.
     residual, change, signed, positive, negative, rises = state[0], state[1], state[2], state[3], state[4], state[5]
     falls, waited, blind, on, off, old = state[6], state[7], state[8], state[9], state[10], state[11]
-    share, begun, legs, shares = state[16], state[17], state[18 : 18 + LEGS], state[18 + LEGS : 18 + 2 * LEGS]
+    shares, legs = state[16], state[17:_OWN]
     levels, own = state[12:16], state[_OWN:]
     radius_words, angle_words, normal = words[4], words[5], floats[4:]
     block = Block(
         residual, change, signed, rises, falls, waited, blind, timed, positive, negative, levels, words[:4],
-        floats[:4], tolerance, key, legs, shares, share, begun,
+        floats[:4], tolerance, key, legs, shares,
     )  # fmt: skip
     zero = tolerance - tolerance
     start_folds, time_folds = folds_of(key, noise.START), folds_of(key, noise.TIME)
@@ -158,7 +158,7 @@ def _simulate(
         look_up(table, shown, shown, levels[now])
         _begin(made, clipped, first)
         for i in range(PIXELS_A_BLOCK):
-            positive[i], negative[i], share[i], begun[i] = threshold_pos, threshold_neg, _WHOLE, zero
+            positive[i], negative[i] = threshold_pos, threshold_neg
         _start(tables, own, block, At(first, 0, False, now, now, shown))
         for i in range(PIXELS_A_BLOCK):
             uniform = np.float32(np.int32(word(start_folds, first + i) >> np.uint32(8))) * _UNIT
@@ -169,6 +169,9 @@ def _simulate(
             for row in range(len(carried)):
                 for i in range(last - first):
                     state[_CARRIED[row], i] = carried[row, first + i]
+        if timed:
+            for i in range(PIXELS_A_BLOCK):
+                old[i], waited[i], blind[i] = residual[i], zero, zero
         if noisy:
             for i in range(PIXELS_A_BLOCK):
                 radius_words[i] = word(pixel_radius, first + i)
@@ -227,21 +230,19 @@ def _simulate(
                     for i in range(PIXELS_A_BLOCK):
                         change[i] += normal[odd, i] * scale
                 _change(tables, own, block, at)
-                if timed:
-                    for i in range(PIXELS_A_BLOCK):
-                        old[i], waited[i], blind[i] = residual[i], zero, zero
                 drifting = residual if drifts_first else change
                 for spot in range(hot, next_hot):
                     drifting[hot_position[spot] - first] += hot_drift[spot] * segments.hot_scale[each]
-                parts = LEGS if _divide(tables, own, block, at) else 1
+                is_divided, begun = _divide(tables, own, block, at), zero
+                if not is_divided:
+                    shares[0] = _WHOLE
+                parts = LEGS if is_divided else 1
                 for leg in range(parts):
-                    at = At(first, each, moved, before, now, shown, leg, parts)
-                    if parts > 1:
-                        _take_leg(leg, block, old)
-                    if _cross(tables, own, block, at):
+                    at = At(first, each, moved, before, now, shown, shares[leg], begun, leg == parts - 1)
+                    if is_divided:
                         for i in range(PIXELS_A_BLOCK):
-                            rises[i], falls[i] = max(signed[i], zero), max(zero - signed[i], zero)
-                    else:
+                            change[i] = legs[leg, i]
+                    if not _cross(tables, own, block, at):
                         for i in range(PIXELS_A_BLOCK):
                             events, residual[i] = crossed(residual[i] + change[i], positive[i], negative[i], tolerance)
                             signed[i], rises[i], falls[i] = events, max(events, zero), max(zero - events, zero)
@@ -257,7 +258,10 @@ def _simulate(
                         if drifts_first:
                             for spot in range(hot, next_hot):
                                 change[hot_position[spot] - first] += hot_drift[spot] * segments.hot_scale[each]
-                        _time(each, segments.first + each, block, old, first, last, time_folds, made, clipped)
+                        _time(segments.first + each, block, at, old, last, time_folds, made, clipped)
+                        for i in range(PIXELS_A_BLOCK):
+                            old[i] = residual[i]
+                    begun += shares[leg]
             if each == count - 1 or segments.bin[each + 1] != of_bin:
                 net = on if is_plain else signed
                 if not is_plain:
@@ -270,29 +274,7 @@ def _simulate(
 
 
 @compiled
-def _take_leg(leg, block, old):
-    """Make a leg the step, in loops of two rows, which the compiler vectorises."""
-    use_widest_vectors()  # type: ignore[call-arg]
-    change, share, begun, residual = block.change, block.share, block.begun, block.residual
-    for i in range(PIXELS_A_BLOCK):
-        change[i] = block.legs[leg, i]
-    if leg > 0:
-        for i in range(PIXELS_A_BLOCK):
-            begun[i] += share[i]
-    else:
-        for i in range(PIXELS_A_BLOCK):
-            begun[i] = block.tolerance - block.tolerance
-    for i in range(PIXELS_A_BLOCK):
-        share[i] = block.shares[leg, i]
-    if block.timed:
-        for i in range(PIXELS_A_BLOCK):
-            old[i] = residual[i]
-        for i in range(PIXELS_A_BLOCK):
-            block.waited[i] = block.blind[i] = block.tolerance - block.tolerance
-
-
-@compiled
-def _time(each, number, block, old, first, last, folds, made, clipped):
+def _time(number, block, at, old, last, folds, made, clipped):
     """Give every event of a segment, or of a leg of it, its time, and pass it to the representations.
 
     Crossings of one pixel come at equal distances. Events that no change of intensity caused (shot noise) come at
@@ -303,7 +285,7 @@ def _time(each, number, block, old, first, last, folds, made, clipped):
         old: [block] real, the residual at its start.
         folds: of the noise's words for these times.
     """
-    found, count = block.words[0], 0
+    found, count, first = block.words[0], 0, at.first
     for pixel in range(last - first):  # without a branch: most pixels have no events
         found[count] = pixel
         count += block.rises[pixel] + block.falls[pixel] > 0
@@ -324,12 +306,12 @@ def _time(each, number, block, old, first, last, folds, made, clipped):
                 passed = min(max(block.waited[i] + (threshold - sign * np.float64(old[i])) / speed, 0.0), 1.0)
                 apart = min(apart, (1.0 - passed) / max(crossings - 1, 1))
             if crossings > 0:
-                passed, apart = block.begun[i] + block.share[i] * passed, block.share[i] * apart
-                _events(made, clipped, Train(first + i, i, each, is_rising, passed, apart, crossings))
+                passed, apart = at.begun + at.share * passed, at.share * apart
+                _events(made, clipped, Train(first + i, i, at.step, is_rising, passed, apart, crossings))
             for k in range(crossings, events):
                 drawn = word((word(folds, first + i), np.uint32(number)), np.uint32(2 * k + is_rising))
                 passed = np.float64(np.int64(drawn)) * 2.0**-32
-                _events(made, clipped, Train(first + i, i, each, is_rising, passed, 0.0, 1))
+                _events(made, clipped, Train(first + i, i, at.step, is_rising, passed, 0.0, 1))
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

@@ -12,9 +12,10 @@ flips between them, so its events alternate. With h = T/tau for a step of T seco
 
 and the bottom alike, mirrored, with E-. A, B and G fit P(max < u) = exp(-lambda(u) h)/Phi(u), lambda the slowest rate
 at which the process leaves (-inf, u); a Brownian bridge with a pull to zero is the second form. Three straight legs
-(:meth:`divide`) then pass the comparator: to one extreme, to the other one, to x'. The bridge visits the extreme next
-to x first and takes a third of the time for each leg; else the order is a coin, the first leg ends at a uniform time,
-the second in the middle of what is left. ``python -m bench noise`` compares with the continuous process.
+(:func:`divide`) then pass the comparator: to one extreme, to the other one, to x'. The bridge visits the extreme next
+to x first and takes a third of the time for each leg. Else the order is a coin, the first leg ends at a uniform time,
+the second in the middle of what is left; a block of pixels shares these times. ``python -m bench noise`` compares with
+the continuous process.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls
@@ -25,13 +26,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from v2v_protocol.errors import UsageError
-from v2v_server.simulation import noise
 from v2v_server.simulation.effects.state import Clip, compiled, hook
 from v2v_server.simulation.intensity import Doubles, exponential, logarithm
-from v2v_server.simulation.pixel import PIXELS_A_BLOCK, folds_of, minus_two_ln, two_normals, word
+from v2v_server.simulation.pixel import PIXELS_A_BLOCK, crossed, folds_of, half_mixed, minus_two_ln, two_normals, word
 from v2v_server.simulation.vectors import use_widest_vectors
 
-FIELD, ROWS = "noise_band_share", 2
+FIELD, ROWS = "noise_band_share", 3
 NOISE, PANEL = True, "still"
 PURPOSES = PIXEL_RADIUS, PIXEL_ANGLE, PAIR_RADIUS, PAIR_ANGLE, PIXEL, STEP = range(16, 22)
 LONGEST_BRIDGE = 1.2
@@ -45,8 +45,7 @@ EXTREMES = np.array([
 ])  # fmt: skip
 """h, A, B and G, linear in ln h; beyond the last h, A grows as the largest of several independent steps does."""
 _FIFTH, _THIRD, _HALF, _ONE = np.float32(0.2), np.float32(1 / 3), np.float32(0.5), np.float32(1)
-_BYTE, _PART = np.uint32(255), np.float32(1 / 256)
-_M0, _M1, _ = noise.MIX_FACTORS
+_PART = np.float32(1 / 256)
 
 
 class Tables(NamedTuple):
@@ -58,6 +57,7 @@ class Tables(NamedTuple):
         sigma: real, log units.
         words: [3, block] uint32 of the pixels: radius, angle, extremes.
         first: int64, number of the first step.
+        is_blind: whether a pixel is blind after an event.
     """
 
     laws: Any
@@ -65,6 +65,7 @@ class Tables(NamedTuple):
     sigma: Any
     words: Any
     first: Any
+    is_blind: Any
 
 
 def prepare(value: float, clip: Clip) -> Tables:
@@ -78,8 +79,8 @@ def prepare(value: float, clip: Clip) -> Tables:
         raise UsageError(f"noise_band_share = {value:g}: set noise_band_hz, the corner of the noise, too")
     sigma = value * sum(clip.thresholds) / 2.0
     laws = laws_of(2.0 * np.pi * corner * clip.durations, sigma) if value > 0.0 else np.empty((0, 6))
-    words = np.empty((3, PIXELS_A_BLOCK), np.uint32)
-    return Tables(laws.astype(clip.real), clip.table_of_step, clip.real(sigma), words, np.int64(clip.first))
+    words, is_blind = np.empty((3, PIXELS_A_BLOCK), np.uint32), clip.effects.get("refractory_seconds", 0.0) > 0.0
+    return Tables(laws.astype(clip.real), clip.table_of_step, clip.real(sigma), words, np.int64(clip.first), is_blind)
 
 
 def laws_of(steps: Doubles, sigma: float) -> Doubles:
@@ -108,63 +109,71 @@ def start(tables, own, block, at):
             tables.words[0, i] = word(radius, at.first + i)
             tables.words[1, i] = word(angle, at.first + i)
             tables.words[2, i] = word(extremes, at.first + i)
-        _draw(tables.words, block, tables.first // 2)
+        _draw(tables, own, block, tables.first // 2)
         for i in range(PIXELS_A_BLOCK):
-            own[0, i], own[1, i] = block.floats[0, i] * tables.sigma, block.floats[1, i]
+            own[0, i] = own[1, i] * tables.sigma
 
 
 @hook
 def divide(tables, own, block, at):
-    """Divide the step into its three legs."""
+    """Divide the step into its three legs; :func:`cross` takes them at once unless events need times or a period."""
     if len(tables.laws) > 0:
         law, number = tables.laws[tables.law_of_step[at.step]], tables.first + at.step + 1
         if number % 2 == 0:
-            _draw(tables.words, block, number // 2)
-            for i in range(PIXELS_A_BLOCK):
-                own[1, i] = block.floats[0, i]
-        of_step = word(folds_of(block.key, STEP), np.uint32(number))
+            _draw(tables, own, block, number // 2)
+        of_step = word(folds_of(block.key, STEP), number)
+        part = (np.float32(np.int32(word((of_step, of_step), at.first) >> np.uint32(24))) + _HALF) * _PART
+        part = _THIRD if law[0] > 0 else part
+        rest = (_ONE - part) * _HALF
+        block.shares[0], block.shares[1], block.shares[2] = part, rest, rest
         _walk(
-            law, tables.words[2], of_step, own[0], own[1], block.change, block.words[0], block.floats[2],
-            block.floats[3], block.legs, block.shares, tables.sigma,
+            law, tables.words[2], of_step, part, rest, own[0], own[1 + number % 2], block.change, block.words[0],
+            block.floats[2], block.floats[3], block.legs, tables.sigma,
         )  # fmt: skip
-        if number % 2 == 0:
-            for i in range(PIXELS_A_BLOCK):
-                own[1, i] = block.floats[1, i]
-        return True
+        return block.timed or tables.is_blind
     return False
 
 
 @hook
-def _draw(words, block, pair):
-    """Draw two normals of each pixel: rows 0 and 1 of ``block.floats``."""
+def cross(tables, own, block, at):
+    """Let a step in one piece pass its legs."""
+    is_whole = len(tables.laws) > 0 and not (block.timed or tables.is_blind)
+    if is_whole:
+        _pass(block.legs, block.residual, block.positive, block.negative, block.rises, block.falls, block.tolerance)
+    return is_whole
+
+
+@hook
+def _draw(tables, own, block, pair):
+    """Draw two normals of each pixel."""
+    words, floats = tables.words, block.floats
     radius, angle = word(folds_of(block.key, PAIR_RADIUS), pair), word(folds_of(block.key, PAIR_ANGLE), pair)
-    two_normals(words[0], words[1], radius, angle, block.words[2], block.words[3], block.floats[2], block.floats)
+    two_normals(words[0], words[1], radius, angle, block.words[2], block.words[3], floats[2], floats)
+    for i in range(PIXELS_A_BLOCK):
+        own[1, i], own[2, i] = floats[0, i], floats[1, i]
 
 
 @compiled
-def _walk(law, pixels, of_step, x, normal, change, drawn, highs, lows, legs, shares, sigma):
-    """Write the legs of a block and their shares of the step, and the noise at its end into ``x``.
+def _walk(law, pixels, of_step, part, rest, x, normal, change, drawn, highs, lows, legs, sigma):
+    """Write the legs of a block, and the noise at the step's end into ``x``.
 
     Args:
         law: [6], see :class:`Tables`.
         pixels, of_step: [block] uint32 and uint32, words of the extremes.
+        part, rest: shares of the step that the first leg takes, and each of the others.
         x: [block] real, the noise, log units; ``normal``: [block], the N of this step.
         change: [block] real, what the step adds without the noise.
         drawn, highs, lows: [block] uint32, and float32 twice: working space.
-        legs, shares: [3, block] real, written.
+        legs: [3, block] real, written.
         sigma: real.
     """
     use_widest_vectors()  # type: ignore[call-arg]
     is_bridge, rho, scale, a, b, g = law[0] > 0, law[1], law[2], law[3], law[4], law[5]
     zero, tiny = sigma - sigma, sigma * np.float32(1e-6)
-    first, second, last, share, rest, other_rest = legs[0], legs[1], legs[2], shares[0], shares[1], shares[2]
+    first, second, last = legs[0], legs[1], legs[2]
     # Short loops of few rows each: of more, the compiler cannot tell that they lie apart.
     for i in range(PIXELS_A_BLOCK):
-        z = np.uint32(pixels[i] ^ of_step)
-        z = np.uint32(z ^ (z >> np.uint32(16)))
-        z = np.uint32(z * _M0)
-        z = np.uint32(z ^ (z >> np.uint32(15)))
-        z = np.uint32(z * _M1)
+        z = half_mixed(np.uint32(pixels[i] ^ of_step))
         drawn[i] = np.uint32(z ^ (z >> np.uint32(15)))
     for i in range(PIXELS_A_BLOCK):
         highs[i] = minus_two_ln(np.uint32((drawn[i] >> np.uint32(1)) | np.uint32(1)))
@@ -184,13 +193,9 @@ def _walk(law, pixels, of_step, x, normal, change, drawn, highs, lows, legs, sha
         rises_first = last[i] < x[i] if is_bridge else (drawn[i] & np.uint32(1)) > 0
         first[i], second[i] = top if rises_first else bottom, bottom if rises_first else top
     for i in range(PIXELS_A_BLOCK):
-        drawn_share = (np.float32(np.int32((drawn[i] >> np.uint32(1)) & _BYTE)) + _HALF) * _PART
-        share[i] = _THIRD if is_bridge else drawn_share
-        rest[i] = other_rest[i] = (_ONE - share[i]) * _HALF
-    for i in range(PIXELS_A_BLOCK):
         before, one, other, after = x[i], first[i], second[i], last[i]
-        first[i], x[i] = change[i] * share[i] + (one - before), after
-        second[i], last[i] = change[i] * rest[i] + (other - one), change[i] * rest[i] + (after - other)
+        first[i], x[i] = change[i] * part + (one - before), after
+        second[i], last[i] = change[i] * rest + (other - one), change[i] * rest + (after - other)
 
 
 @hook
@@ -200,3 +205,16 @@ def _bridged(y, apart, minus_two_ln_u, twice_h, over_h, k, tiny, sigma):
     m = (y + np.sqrt(q + twice_h * minus_two_ln_u)) * _HALF
     slope = max(over_h + k * m / (m + m - y + tiny), over_h * _FIFTH)
     return (y + np.sqrt(q + sigma * sigma / slope * (minus_two_ln_u + minus_two_ln_u))) * _HALF
+
+
+@compiled
+def _pass(legs, residual, positive, negative, rises, falls, tolerance):
+    """Let all legs of a block pass the comparator, one after another."""
+    use_widest_vectors()  # type: ignore[call-arg]
+    first, second, last, zero = legs[0], legs[1], legs[2], tolerance - tolerance
+    for i in range(PIXELS_A_BLOCK):
+        one, left = crossed(residual[i] + first[i], positive[i], negative[i], tolerance)
+        other, left = crossed(left + second[i], positive[i], negative[i], tolerance)
+        final, left = crossed(left + last[i], positive[i], negative[i], tolerance)
+        rises[i] = max(one, zero) + max(other, zero) + max(final, zero)
+        falls[i], residual[i] = rises[i] - (one + other + final), left

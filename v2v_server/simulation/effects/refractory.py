@@ -66,15 +66,16 @@ def cross(tables, own, block, at):
     """Fire events one after another in time."""
     refractory, seconds = tables
     if refractory > 0:
-        whole, blind = seconds[at.step], own[0]
+        duration, blind, zero = seconds[at.step] * at.share, own[0], block.tolerance - block.tolerance
         if block.timed:
             for i in range(PIXELS_A_BLOCK):
-                duration = whole * block.share[i]
                 block.waited[i], block.blind[i] = blind[i] / duration, refractory / duration
         for i in range(PIXELS_A_BLOCK):
             block.signed[i], block.residual[i], blind[i] = crossed(
-                block.residual[i], blind[i], block.change[i], whole * block.share[i], refractory, block.positive[i],
+                block.residual[i], blind[i], block.change[i], duration, refractory, block.positive[i],
                 block.negative[i], block.tolerance,
             )  # fmt: skip
+        for i in range(PIXELS_A_BLOCK):
+            block.rises[i], block.falls[i] = max(block.signed[i], zero), max(zero - block.signed[i], zero)
         return True
     return False

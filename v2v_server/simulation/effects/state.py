@@ -73,9 +73,8 @@ class Block(NamedTuple):
         words: [4] uint32 rows, and ``floats``: [4] float32 rows, free for use within one call.
         tolerance: real, see ``voxel.py``.
         key: [4] uint32, the noise key.
-        legs, shares: [LEGS] rows for a step that is divided: the change of each leg, and its share of the time.
-        share, begun: share of the step's time that the leg takes, and that has passed before it; 1 and 0 for a step in
-            one piece.
+        legs: [LEGS] rows for a step that is divided, the change of each leg.
+        shares: [LEGS] real, their shares of its time.
     """
 
     residual: Any
@@ -95,8 +94,6 @@ class Block(NamedTuple):
     key: Any
     legs: Any
     shares: Any
-    share: Any
-    begun: Any
 
 
 class At(NamedTuple):
@@ -109,7 +106,9 @@ class At(NamedTuple):
         before, now: rows of ``Block.levels``: log intensity before and after the step.
         shown: [width] uint8 or uint16, grey levels of the frame at or after its end; narrower than the block at the
             end of the picture.
-        leg: number of the leg; ``legs``: how many the step has, LEGS or 1.
+        share, begun: share of the step's time that the leg takes, and that has passed before it; 1 and 0 for a step in
+            one piece.
+        is_last: whether it is the step's last leg.
     """
 
     first: Any
@@ -118,5 +117,6 @@ class At(NamedTuple):
     before: Any
     now: Any
     shown: Any
-    leg: Any = 0
-    legs: Any = 1
+    share: Any = 1
+    begun: Any = 0
+    is_last: Any = True
