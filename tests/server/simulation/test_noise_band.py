@@ -10,7 +10,7 @@ import pytest
 
 from bench.accuracy.noise import Setup, distance, scene_of, simulated, true
 from v2v_protocol.errors import RecipeError, UsageError
-from v2v_protocol.recipe import Recipe
+from v2v_protocol.recipe import Recipe, most_events
 from v2v_server.simulation import simulate
 from v2v_server.simulation.effects.noise_band import laws_of
 
@@ -65,6 +65,13 @@ def test_arrays_count_the_events_of_the_list() -> None:
     assert [(~events.p).sum(), events.p.sum()] == counts.sum(axis=(0, 2, 3, 4)).tolist()
     np.testing.assert_array_equal(counts[:, 1] - counts[:, 0], made.voxels)
     assert made.array("voxels_bilinear").sum() == pytest.approx(made.voxels.sum(), abs=1.0)
+
+
+def test_the_bound_of_events_holds_for_the_loudest_noise() -> None:
+    made = simulate(STILL, **NOISE | {"noise_band_share": 10.0, "noise_band_hz": 1e4}, frames_per_second=30.0)
+    most = made.array("event_counts").sum(axis=(0, 1, 2)).max()
+    quiet = most_events(made.given.segments, (0.0, 0.0), (0.2, 0.2), 0.0)
+    assert quiet < most <= most_events(made.given.segments, (0.0, 0.0), (0.2, 0.2), 0.0, *made.given.worst)
 
 
 def test_noise_without_a_corner_is_refused() -> None:

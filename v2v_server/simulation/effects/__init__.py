@@ -15,7 +15,7 @@ that it does) and one file here, named in :data:`EFFECTS`. The file states the e
 
     FIELD                     the recipe's field
     ROWS                      the number of rows of a block's state that it needs
-    NOISE                     whether it fires where nothing moves: its value is then a rate in Hz
+    NOISE                     whether it fires where nothing moves: a value in Hz is then the rate
     PURPOSES                  purposes of its words of noise (``noise.py``), numbers that no other effect has; if any
     PANEL                     the panel of ``v2v-fit`` that shows it: "rates", "still", "pixels" or "intervals"
     prepare(value, clip)      its tables; for the value 0 they have the same types and switch everything off
