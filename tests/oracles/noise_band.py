@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numba
 import numpy as np
@@ -56,7 +55,7 @@ def continuous(
 
 
 @numba.njit(cache=True)
-def _walked(levels, parts, h, thresholds, residual, sigma, seed) -> Any:
+def _walked(levels, parts, h, thresholds, residual, sigma, seed):
     np.random.seed(seed)
     steps, pixels = len(levels) - 1, levels.shape[1]
     on, off = np.zeros((steps, pixels), np.int64), np.zeros((steps, pixels), np.int64)
