@@ -25,6 +25,7 @@ import numpy.typing as npt
 
 from bench.frame import Column, Record, Report, add_whole, beyond
 from tests.oracles.noise_band import Counted, continuous, triangular_starts
+from v2v_protocol.command import Parser
 from v2v_server.simulation import simulate
 from v2v_server.simulation.intensity import log_table_float64
 
@@ -78,7 +79,7 @@ def scene_of(setup: Setup) -> npt.NDArray[np.uint8]:
         "sine": middle + 4 * THRESHOLD * np.sin(2 * np.pi * (5.0 * seconds + phase)),
         "ramp": middle + 2 * THRESHOLD * (seconds - _SECONDS / 2) * np.where(phase < 0.5, 1.0, -1.0),
     }[setup.scene]
-    grey = np.searchsorted((table[1:] + table[:-1]) / 2, level).astype(np.uint8)
+    grey: npt.NDArray[np.uint8] = np.searchsorted((table[1:] + table[:-1]) / 2, level).astype(np.uint8)
     return grey.reshape(-1, setup.side_px, setup.side_px)
 
 
@@ -156,7 +157,7 @@ def missed(records: Sequence[Record]) -> list[str]:
     return lines
 
 
-def add_flags(parser: argparse.ArgumentParser) -> None:
+def add_flags(parser: Parser) -> None:
     """Add the bench's flags."""
     add_whole(parser, "--side", 64, "side of the picture, px")
 
