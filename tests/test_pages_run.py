@@ -46,6 +46,7 @@ CANNOT = {
 _BLOCK = re.compile(r"(?:^(?: {4}.*)?\n)+", re.M)
 _COMMAND = re.compile(r"^ {4}(v2v-[a-z]+ .*)$", re.M)
 _NAMES = re.compile(rf"(?<= )({'|'.join(map(re.escape, (*VIDEOS, *FOLDERS)))})/?(?= |$)")
+_ASIDE = re.compile(r" --workers \d+| +#.*")
 _INLINE = re.compile(r"`(v2v-[a-z]+ [^`]*--out [^`]*)`")
 
 
@@ -63,12 +64,14 @@ def can_run(line: str) -> bool:
 
 
 def distinct_blocks() -> Iterator[Any]:
-    """Each block with a line that no block before it has; folders and videos are the same under any name."""
+    """Each block with a line that no block before it has. Folders and videos are the same under any name, and numbers
+    of workers are; remarks do not count."""
     seen: set[str] = set()
     for page in PAGES:
         for block in blocks(page):
             lines = [line for line in block if can_run(line)]
-            kinds = {_NAMES.sub(lambda name: "VIDEO" if name[0] in VIDEOS else "DIR", line) for line in lines}
+            plain = [_ASIDE.sub("", line) for line in lines]
+            kinds = {_NAMES.sub(lambda name: "VIDEO" if name[0] in VIDEOS else "DIR", line) for line in plain}
             if not kinds <= seen:
                 yield pytest.param(lines, id=f"{page.stem}: {block[0][:40].strip()}")
             seen |= kinds
