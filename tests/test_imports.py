@@ -59,11 +59,11 @@ PROTOCOL_MAY = {*sys.stdlib_module_names, "numpy", "msgpack", "v2v_protocol"}
 
 
 FLOORS = (
-    "system", "keys", "video", "simulation", "labels", "motion", "flow", "worlds", "store", "kinds", "config", "corpus",
-    "lease_memory", "corpus_words", "schedule",
+    "system", "keys", "video", "simulation", "labels", "motion", "flow", "worlds", "recorded", "store", "kinds",
+    "config", "corpus", "lease_memory", "corpus_words", "schedule",
     "quarantine", "sharing",
     "broker",
-    "worker", "supervise", "status", "prepare", "page",
+    "worker", "supervise", "status", "prepare", "prepare_recordings", "page",
     "serve", "commands",
 )  # fmt: skip
 """The rooms of the server, from the ground up: each imports only from itself and from those before it."""
@@ -218,6 +218,8 @@ def test_no_modules_import_each_other() -> None:
             - {
                 "config",
                 "prepare",
+                "prepare_recordings",
+                "recorded",
                 "quarantine",
                 "schedule",
                 "corpus_words",

@@ -284,7 +284,7 @@ WRONG = [
     ("v2v-preview a.mp4 --out x.png --preset c.yaml", "--recipe c.yaml"),
     ("v2v-serve --videos clips --preset natual", "did you mean 'natural'"),
     ("v2v-serve --videos clips --recipe natural", "--preset natural"),
-    ("v2v-preview a.mp4 --out x.png --recipe dvs346", "did you mean 'davis346'"),
+    ("v2v-preview a.mp4 --out x.png --recipe davis346-runing", "did you mean 'davis346-running'"),
     ("v2v-preview a.mp4 --out x.png --recipe none.yaml", "none.yaml: No such file"),
     ("v2v-serve --videos clips --set bins", "write KEY=VALUE"),
     ("v2v-serve --videos clips --set bins=0", "from 1 to 1024"),

@@ -14,12 +14,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 
 from bench.processes import free_ports
 from tests.clips import panned_luma, write_panned
 from tests.test_commands import MODULES, ROOT
+from v2v_recordings.items import EventChunk, Picture
+from v2v_recordings.layout_writer import RecordingWriter
+from v2v_server.prepare_recordings import convert_recordings
 
 VIDEOS = ("my.mp4", "VIDEO", "bigbuckbunny.mp4")
 FOLDERS = ("smaller", "DIR", "CLIPS", "CORPUS", "webvid10k", "my-videos", "clips")
@@ -113,6 +117,16 @@ def test_documented_commands_run(
         (tmp_path / "openvid" / "train").mkdir(parents=True)
         with tarfile.open(tmp_path / "openvid" / "train" / "00000.tar", "w") as archive:
             archive.add(clips, "clips")
+    if any("--videos-kind recordings" in line for line in lines):
+        at = np.arange(9000)
+        (tmp_path / "raw").mkdir()
+        with RecordingWriter(tmp_path / "raw/a.h5", source="test") as writer:
+            writer.add(EventChunk(1_000_000 * at, at % 128, at % 127, at % 2 == 0))
+            for number, luma in enumerate(panned_luma(45, 128, 128)):
+                writer.add(Picture(200_000_000 * number, luma))
+        if not any("v2v-prepare" in line for line in lines):
+            made = convert_recordings(tmp_path / "raw", tmp_path / "recordings", 1)
+            assert not any(each.problem for each in made)
     if any("photographs/" in line for line in lines):
         (tmp_path / "photographs").mkdir()
         Image.fromarray(panned_luma(1, 256, 256)[0]).save(tmp_path / "photographs/a.jpg")

@@ -72,7 +72,7 @@ class V2VDataset(Fixed, Dataset[Sample]):
         rows: rows of each picture to use, as for ``v2v-serve --rows``.
         list_file: list file that restricts a folder.
         cache_dir: folder of the catalogue's index; None uses the user's cache.
-        videos_kind, rate, photograph_seconds, picture_bits: what a video is, as for ``v2v-serve --videos-kind``.
+        videos_kind, rate, photograph_seconds, picture_bits, marks: what a video is, as for ``v2v-serve --videos-kind``.
         labels: see :class:`v2v_client.V2VStreamDataset`.
         options: ``preset`` and other fields of :class:`v2v_protocol.spec.StreamSpec`.
 
@@ -95,6 +95,7 @@ class V2VDataset(Fixed, Dataset[Sample]):
         rate: float = 0.0,
         photograph_seconds: float = 0.0,
         picture_bits: int = 0,
+        marks: str = "pictures",
         labels: Labels = "required",
         **options: Any,
     ) -> None:
@@ -108,7 +109,7 @@ class V2VDataset(Fixed, Dataset[Sample]):
         self._videos = require_videos(videos)
         self._kind = {
             "videos_kind": videos_kind, "rate": rate, "photograph_seconds": photograph_seconds,
-            "picture_bits": picture_bits,
+            "picture_bits": picture_bits, "marks": marks,
         }  # fmt: skip
         self._source = {"rows": rows, "list_file": list_file, "cache_dir": cache_dir}
         self._maker: Any = None

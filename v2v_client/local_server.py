@@ -183,15 +183,19 @@ class LocalServer:
 
 def server_flags(recipe: Recipe, options: Mapping[str, Any], *others: str) -> list[str]:
     """Return flags that give ``v2v-serve`` a stream's recipe, so that its start names the videos that are too small,
-    and its scene analysis.
+    and what the recipe may need: its scene analysis and dtype.
 
     Args:
         options: fields of the stream's spec by name; None takes the default.
         others: more flags.
     """
-    scene = StreamSpec.from_dict({key: options.get(key) for key in ("preset", "scene")}).scene
+    named = ("scene", "voxel_dtype")
+    spec = StreamSpec.from_dict({key: options.get(key) for key in ("preset", *named)})
     flags = [text for key, value in recipe.to_dict().items() for text in ("--set", f"{key}={json.dumps(value)}")]
-    return [*flags, *(() if scene == "off" else ("--scene", scene)), *others]
+    for name in named:
+        if (value := getattr(spec, name)) != getattr(StreamSpec(), name):
+            flags += (f"--{name.replace('_', '-')}", value)
+    return [*flags, *others]
 
 
 def _tree(pid: int) -> Iterator[psutil.Process]:

@@ -215,6 +215,8 @@ class Camera:
         """Return the draw in one line, without what is zero."""
         params = self.provenance.params
         parts = [f"threshold +{params.threshold_pos:.2f} / -{params.threshold_neg:.2f}"]
+        if self.provenance.is_recorded:
+            parts = ["recorded", *(_with_unit(name, value) for name, value in params.added.items() if value)]
         if params.noise_sigma:
             parts.append(f"noise {params.noise_sigma:.3f}")
         if params.hot_pixel_count:

@@ -79,7 +79,7 @@ def _draw_camera(page: Canvas, camera: Camera, place: int, top: int, number: int
     left = [PAGE_MARGIN_PX + column * (tile_px + GAP_PX) for column in range(3)]
     top += _CAMERA_PX
     page.text(left[0], top, "video frame", size=canvas.HEADING_PT)
-    events_heading(page, left[1], top, "events:")
+    events_heading(page, left[1], top)
     top += _NAMES_PX
     labelled_panel(page, camera, grid, left[0], top, draw_grey(camera.picture(grid)), tile_px, with_text=True)
     events = draw_events(camera.voxels[grid, bin_], scale.full)

@@ -395,9 +395,9 @@ def bin_headings(page: Canvas, left: Sequence[int], y: int, tile_px: int) -> Non
             page.text(end, y, "time", colour=canvas.SOFT, anchor="ra")
 
 
-def events_heading(page: Canvas, x: float, y: float, what: str = "simulated events:") -> None:
-    """Write the heading of events, with what red and blue mean."""
-    x = page.text(x, y, what, size=canvas.HEADING_PT)
+def events_heading(page: Canvas, x: float, y: float) -> None:
+    """Write the heading of events, simulated or recorded, with what red and blue mean."""
+    x = page.text(x, y, "events:", size=canvas.HEADING_PT)
     x = page.text(x + 10, y, "brighter", size=canvas.HEADING_PT, colour=BRIGHTER)
     page.text(x + 10, y, "darker", size=canvas.HEADING_PT, colour=DARKER)
 
@@ -444,6 +444,8 @@ def _moment(page: Canvas, camera: Camera, pick: int, scale: Scale, left: list[in
             label(page, left[1 + number] + 5, y + 5, "paused")
     if camera.flow is not None:
         flow_panel(page, left[-1], y, camera.flow[pick], scale.largest_px, tile_px)
+        if "flow" in camera.provenance.unlabelled:
+            label(page, left[-1] + 5, y + 5, "not known")
 
 
 def _legend(page: Canvas, cameras: Sequence[Camera], scale: Scale, top: int) -> None:

@@ -128,6 +128,29 @@ _WORLDS: Mapping[str, Any] = {
 }
 """Photographs that move, for the paper's pixel: from a tripod to a run, up to 7 px from frame to frame at 60 Hz."""
 
+_RUNNING: Mapping[str, Any] = {
+    "start": "triangular",  # a residual that moves as a Brownian motion: where it stands in the long run
+    # v2e's logarithm becomes linear below 20 of 255, with the slope of an epsilon of 0.026; half and twice of it.
+    "log_eps": (0.013, 0.052),
+    "threshold": (0.134, 0.405),  # ln 1.143, its least contrast, to ln 1.5 (Gallego et al. 2022)
+    "threshold_mismatch_sigma": (0.05, 0.16),  # 2.1 % of contrast (Lichtsteiner et al. 2008) at these thresholds
+    "rate_draw": "log",  # quiet cameras are as common as loud ones
+    # Around v2e's `noisy`, 5, and two recordings, 0.44 and 4.06 a pixel, halved by grey light. But the first moves, and
+    # 37 % of the second are bursts: "davis346-measured" has the rates of still pixels.
+    "shot_noise_hz": (0.1, 10.0),
+    "leak_hz": (0.05, 0.2),  # around v2e's 0.1
+    "refractory_seconds": (1e-4, 1e-3),  # ESIM's examples 1e-4, v2e's default 5e-4; the upper end is a guess
+    "photoreceptor_hz": (300.0, 3000.0),  # v2e's default; the bandwidth in bright light of Lichtsteiner et al. 2008
+    "dead_pixel_share": (0.0, 1e-4),  # a guess
+    "noise_sigma": (0.0, 0.0),
+    "noise_unit": "second",
+    "hot_pixel_share": (0.0, 5e-4),  # a guess, as its sigma
+    "hot_pixel_sigma": (0.0, 20.0),
+}
+"""A DAVIS346 in ordinary light that has run for a while. Numbers are from sources, no fit (docs/effects.md). ``gamma``
+stays that of the videos; for frames that are linear in intensity, as a DAVIS stores them, set it to 1.
+"""
+
 PRESET_FIELDS: Mapping[str, Mapping[str, Any]] = {
     "paper": {},
     # Ablation "-F": one draw of the thresholds per video, the same in every epoch.
@@ -173,29 +196,32 @@ PRESET_FIELDS: Mapping[str, Mapping[str, Any]] = {
         "hot_pixel_share": (0.0, 5e-4),
         "hot_pixel_sigma": (0.0, 20.0),
     },
-    # Its successor, a DAVIS346 that has run for a while. Numbers are from sources, no fit (docs/effects.md).
-    # `gamma` stays that of the videos; for frames that are linear in intensity, as a DAVIS stores them, set it to 1.
-    "davis346-running": {
-        "start": "triangular",  # a residual that moves as a Brownian motion: where it stands in the long run
-        # v2e's logarithm becomes linear below 20 of 255, with the slope of an epsilon of 0.026; half and twice of it.
-        "log_eps": (0.013, 0.052),
-        "threshold": (0.134, 0.405),  # as davis346
-        "threshold_mismatch_sigma": (0.05, 0.16),  # 2.1 % of contrast (Lichtsteiner et al. 2008) at these thresholds
-        "rate_draw": "log",  # still scenes of two DAVIS cameras differ by 9 in their rate of noise
-        "shot_noise_hz": (0.1, 10.0),  # around those two, 0.44 and 4.06 a pixel, halved by grey light; v2e's `noisy`: 5
-        "leak_hz": (0.05, 0.2),  # around v2e's 0.1
-        "refractory_seconds": (1e-4, 1e-3),  # as davis346
-        "photoreceptor_hz": (300.0, 3000.0),  # v2e's default; the bandwidth in bright light of Lichtsteiner et al. 2008
-        "dead_pixel_share": (0.0, 1e-4),  # a guess, as davis346
-        "noise_sigma": (0.0, 0.0),
-        "noise_unit": "second",
-        "hot_pixel_share": (0.0, 5e-4),  # a guess, as davis346
-        "hot_pixel_sigma": (0.0, 20.0),
+    "davis346-running": _RUNNING,
+    # The same with the noise of still pixels, as measured in two cameras.
+    "davis346-measured": {
+        **_RUNNING,
+        # 0.006 events a second in a DAVIS346, 2.4 in a DAVIS240C without the bursts of its exposure. A pixel of 0.27 of
+        # white has 0.8 of a black one's.
+        "shot_noise_hz": (0.0075, 3.0),
+        "leak_hz": (0.01, 0.2),  # around the surplus of brighter events in the DAVIS346, 0.015, and v2e's 0.1
     },
     "worlds": _WORLDS,
     # The same, closer to light (docs/guides/photographs.md).
     "worlds-fine": {**_WORLDS, "world_bits": 16, "world_change_share": 0.5},
+    # Recordings of event cameras, which have their own noise: a grid from each mark to the next.
+    "recordings": {
+        "grids_per_frame": 1,
+        "noise_sigma": (0.0, 0.0),
+        "hot_pixel_share": (0.0, 0.0),
+        "hot_pixel_sigma": (0.0, 0.0),
+        "pause_probability": 0.0,
+    },
 }
+
+DEPRECATED: Mapping[str, str] = dict.fromkeys(("sensor", "davis346"), "davis346-measured")
+"""Recipes that stay readable but are not listed, with their successors."""
+LISTED = tuple(name for name in PRESET_FIELDS if name not in DEPRECATED)
+"""Names of recipes to choose from."""
 
 STREAM_PRESETS: Mapping[str, Mapping[str, Any]] = {
     "exact": {"samples_per_decode": 1},
@@ -204,6 +230,7 @@ STREAM_PRESETS: Mapping[str, Mapping[str, Any]] = {
     "natural": {"samples_per_decode": 1, "scene": "auto", "moving_share": 0.75},
     "worlds": {"samples_per_decode": 1, "recipe": "worlds"},
     "worlds-fine": {"samples_per_decode": 1, "recipe": "worlds-fine"},
+    "recordings": {"samples_per_decode": 1, "recipe": "recordings"},
     "natural-davis346": {
         "samples_per_decode": 1, "scene": "auto", "moving_share": 0.75, "recipe": "davis346-running",
     },
@@ -211,7 +238,7 @@ STREAM_PRESETS: Mapping[str, Mapping[str, Any]] = {
 """Spec fields that each preset sets; a recipe by its name. The first three trade accuracy for speed
 (`docs/accuracy.md`); "natural" is for videos as they are: what spoils events is left out, and most crops show something
 that moves (`docs/scene.md`); "natural-davis346" shows them to a running camera (`docs/effects.md`); "worlds" and
-"worlds-fine" are for photographs (`docs/guides/photographs.md`).
+"worlds-fine" are for photographs (`docs/guides/photographs.md`), "recordings" for recordings of event cameras.
 """
 
 
@@ -226,6 +253,9 @@ LARGEST_SCALE = 100.0
 EFFECTS_SECTION = "Effects beyond the paper's model; zero is off"
 """The group of fields that switch on an effect where the upper end of their range is above zero."""
 WORLDS_SECTION = "Worlds: photographs that move (--videos-kind photographs)"
+RECORDED_SECTION = "Recordings of event cameras (--videos-kind recordings)"
+ADDED = "added_sigma", "added_hot_share", "added_hot_sigma"
+"""Fields of the noise that is added to finished bins."""
 TIME_UNITS = ("Hz", "s")
 """An effect in one of these needs the time between frames."""
 STARTS = ("uniform", "triangular", "zero")
@@ -480,6 +510,21 @@ class Recipe(Persisted):
     )  # fmt: skip
     track_points: int = whole(64, 1, 65_536, "N, points that the array tracks follows", is_later=True)
 
+    bin_span: str = word(
+        "grid", ("grid", "events"),
+        "bins of a grid are equal parts of its time; events: of the time from its first event to its last, as in the "
+        "released code",
+        is_later=True, group=RECORDED_SECTION,
+    )  # fmt: skip
+    added_sigma: Range = span(
+        (0.0, 0.0), 0.0, 1e6, "standard deviation of noise that is added to every finished bin, events", is_later=True
+    )
+    added_hot_share: Range = span(
+        (0.0, 0.0), 0.0, 1.0, "share of the crop's pixels whose finished bins all get the same value added",
+        is_later=True,
+    )  # fmt: skip
+    added_hot_sigma: Range = span((0.0, 0.0), 0.0, 1e6, "standard deviation of that value, events", is_later=True)
+
     def __post_init__(self) -> None:
         check_settings(self, "recipe {}".format, RecipeError)
         if self.grids_per_frame and self.frames_per_bin != 1:
@@ -531,6 +576,16 @@ class Recipe(Persisted):
             for name, setting in settings_of(Recipe).items()
             if name.startswith("world_")
         )
+
+    @property
+    def is_recorded(self) -> bool:
+        """Return whether a field is set that only recordings can obey."""
+        return self.bin_span != "grid" or self.is_noisy
+
+    @property
+    def is_noisy(self) -> bool:
+        """Return whether noise may be added to finished bins."""
+        return any(any(getattr(self, name)) for name in ADDED)
 
     @property
     def timed_effects(self) -> bool:
@@ -736,10 +791,13 @@ def warn_unusual(side: str, values: Mapping[str, Any], say: Callable[[str], obje
     known = settings_of(Recipe)
     for name, value in values.items():
         setting = known["threshold" if name in ("threshold_pos", "threshold_neg") else name]
-        line = setting.warning(f"warning: {side}{name}", value)
-        if line and line not in _WARNED:
-            _WARNED.add(line)
-            say(line)
+        _say_once(setting.warning(f"warning: {side}{name}", value), say)
+
+
+def _say_once(line: str, say: Callable[[str], object] = _LOG.warning) -> None:
+    if line and line not in _WARNED:
+        _WARNED.add(line)
+        say(line)
 
 
 @cache
@@ -752,13 +810,15 @@ PRESETS: dict[str, Recipe] = {name: Recipe(**fields) for name, fields in PRESET_
 
 
 def preset(name: object) -> Recipe:
-    """Return the recipe with this name.
+    """Return the recipe with this name; warn once in a process if it is deprecated.
 
     Raises:
         RecipeError: there is no such recipe; the message lists them.
     """
     if not isinstance(name, str) or name not in PRESETS:
-        near, known = nearest(name, PRESETS), ", ".join(PRESETS)
+        near, known = nearest(name, LISTED), ", ".join(LISTED)
         near = f": it is a preset of the stream, --preset {name}" if str(name) in STREAM_PRESETS else near
         raise RecipeError(f"unknown recipe {format_value(name)}{near}; known: {known}, or a file that ends in .yaml")
+    if name in DEPRECATED:
+        _say_once(f"warning: recipe {name} is deprecated: give {DEPRECATED[name]}. Samples of {name} stay as they are.")
     return PRESETS[name]

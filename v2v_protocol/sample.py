@@ -211,6 +211,8 @@ frames that are simulated, the first included. boxes, masks and tracks belong to
 hold classes; 255 marks a sample without labels. Masks of photographs need no sidecar: 0 is the photograph, 1 and 2 the
 patches in front of it. tracks follow ``track_points`` points, and only photographs have them."""
 DEFAULT_ARRAYS = ("voxels", "frames")
+RECORDING_FORMAT = "v2v recording"
+"""Decoder of samples whose events were recorded, not simulated."""
 Layout: TypeAlias = Mapping[str, tuple[str, tuple[int, ...]]]
 """dtype and shape of each array of one sample, by name, in the order of the headers."""
 
@@ -262,6 +264,7 @@ class SampleParams(Persisted):
         voxel_seconds: drawn duration of a voxel grid; 0 if the recipe states none.
         grid_steps: steps between frames that each grid of this duration spans; empty if the recipe states none.
         exposure_seconds: of the frames that are blurred; 0 if the recipe states none.
+        added: values drawn for the noise that is added to finished bins, by field; empty without.
     """
 
     threshold_pos: float
@@ -281,6 +284,7 @@ class SampleParams(Persisted):
     voxel_seconds: float = later(0.0)
     grid_steps: tuple[int, ...] = later(())
     exposure_seconds: float = later(0.0)
+    added: Mapping[str, float] = later(default_factory=dict)
 
     def __post_init__(self) -> None:
         known = effect_settings()
@@ -364,6 +368,11 @@ class Provenance(Persisted):
     substeps: int = later(0)
     remark: str = later("")
     dropped: Mapping[str, int] = later(default_factory=dict)
+
+    @property
+    def is_recorded(self) -> bool:
+        """Return whether the events are those of a camera, so that thresholds and noise of the draw were not used."""
+        return self.decoder.startswith(RECORDING_FORMAT)
 
     @property
     def labelled(self) -> bool:

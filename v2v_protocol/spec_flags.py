@@ -11,7 +11,7 @@ from typing import Any
 
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import PRESETS, STREAM_PRESETS
+from v2v_protocol.recipe import LISTED, PRESETS, STREAM_PRESETS
 from v2v_protocol.safe_yaml import YamlError, parse_yaml, read_yaml
 from v2v_protocol.settings import nearest, settings_of
 from v2v_protocol.spec import StreamSpec
@@ -21,7 +21,7 @@ _RECIPE_FILES = (".yaml", ".yml")
 
 def add_recipe(parser: Parser, group: str = "Stream") -> None:
     """Add ``--recipe`` and ``--set``."""
-    named = ", ".join(PRESETS)
+    named = ", ".join(LISTED)
     recipe = parser.group(group)
     recipe.add_argument(
         "--recipe", metavar="NAME", help=f"virtual cameras: {named}, or a YAML file of fields (default paper)"

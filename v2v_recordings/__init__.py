@@ -12,7 +12,10 @@ faery_reader.py  aedat4, Event Stream, by the package faery
 prophesee.py     EVT 2, EVT 3, DAT
 evt3.py          words of EVT 3 decoded and encoded
 writers.py       a writer for each form, which takes events and pictures piece by piece
-layout.py        the h5 layout of this project's recordings; layout_writer.py writes it from items of any reader
+item_writer.py   what files written from items of any reader have in common: order, origin of time, size, notes
+layout.py        the h5 layout of this project's recordings; layout_writer.py writes it from items
+block_file.py    the form that is served: events in blocks, written from items
+binning.py       events summed into the bins of a voxel grid
 late_signals.py  Ctrl-C between two writes, not within one
 limits.py        sizes and times that each form can hold
 time_stamps.py   times of pictures in a text, whose unit may be open

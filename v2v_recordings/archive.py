@@ -22,7 +22,7 @@ from v2v_protocol.programs import name_extra
 from v2v_recordings.items import SensorSize
 
 ZIPS = (".zip", ".npz")
-MOST_TIMES, ALWAYS_BYTES, LARGEST_PIECE = 256, 1 << 24, 1 << 30
+MOST_TIMES, ALWAYS_BYTES, LARGEST_PIECE = 256, 1 << 24, 1 << 29
 """What a file states of its content may take this many times the file's size, or ALWAYS_BYTES; a piece of it that is
 unpacked at once, at most LARGEST_PIECE as well. Event data and pictures pack to a hundredth at best.
 """

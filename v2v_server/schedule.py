@@ -46,6 +46,7 @@ from v2v_server.corpus.scenes.scene import Sides
 from v2v_server.corpus.videos import SplitVideos, VideoEntry
 from v2v_server.corpus.videos import Videos as CatalogueVideos
 from v2v_server.corpus_words import longest_clip, too_small, why_unsuited
+from v2v_server.kinds.kind import VideosKind
 from v2v_server.kinds.registry import VIDEOS, kind_of
 from v2v_server.lease_memory import most_steps
 from v2v_server.video.rows import Rows
@@ -111,6 +112,18 @@ def _columns(videos: _Videos) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int
     return frames, sizes, SplitVideos.of(pieces) if len(pieces) == len(videos) else None
 
 
+def suitable_kind(videos: _Videos, spec: StreamSpec) -> VideosKind:
+    """Return the kind of these videos.
+
+    Raises:
+        UsageError: no sample of the spec can be made of it.
+    """
+    kind = kind_of(videos[0].id) if len(videos) else VIDEOS
+    if why := kind.refuses(spec):
+        raise UsageError(why)
+    return kind
+
+
 class SequenceTable:
     """All sequences of a corpus under one spec, in catalogue order, looked up by rank.
 
@@ -134,9 +147,7 @@ class SequenceTable:
 
     def __init__(self, videos: _Videos, rows: Rows, spec: StreamSpec, columns: Columns | None = None) -> None:
         self._all, self._rows, self._spec, self._columns = videos, rows, spec, columns or Columns(videos)
-        self._kind = kind_of(videos[0].id) if len(videos) else VIDEOS
-        if why := self._kind.refuses(spec):
-            raise UsageError(why)
+        self._kind = suitable_kind(videos, spec)
         if spec.scene != "off" and self._columns.split is None:
             raise UsageError(
                 f'scene = "{spec.scene}" needs statistics of the videos, which this catalogue was opened without: '

@@ -113,7 +113,7 @@ def describe_motion(found: MeasuredMotion, defects: Sequence[Defect] = ()) -> tu
     )
     if lost > MOST_LOST:
         return text, "something small or fast moves, or flickers, or is noise: sub-steps do not help"
-    return text, f"{JUDGE} tells the error without and with sub-steps, at twice this motion" if fast > 1.0 else ""
+    return text, f"{JUDGE} tells the error without and with sub-steps" if fast > 1.0 else ""
 
 
 @dataclass(frozen=True, slots=True)

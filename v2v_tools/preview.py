@@ -146,7 +146,8 @@ def preview(
     _check_sizes(cameras, out.suffix.lower())
     for note, titles in notes.items():
         say(f"{', '.join(titles) if len(titles) < len(wanted) else 'all cameras'}: {note}")
-    say(f"{describe_start(started)} (recipe field start)")
+    if kind.is_simulated:
+        say(f"{describe_start(started)} (recipe field start)")
     if kind.has_motion:
         say(f"motion: {'; '.join(filter(None, describe_motion(together(moving), defects)))}")
     write_file(out, _content(out.suffix.lower(), whole, cameras, title, moments))
@@ -285,8 +286,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         "v2v-preview", "VIDEO|DIR [VIDEO ...] --out FILE [flags]",
         "Show the effect of a recipe on your videos: frames, events, flow, activity.",
         [
-            "v2v-preview clips/ --out sheet.png --recipe davis346",
-            "v2v-preview clip.mp4 --out compared.html --compare paper clean davis346",
+            "v2v-preview clips/ --out sheet.png --recipe davis346-measured",
+            "v2v-preview clip.mp4 --out compared.html --compare paper clean davis346-measured",
         ],
     )  # fmt: skip
     cameras = parser.group("Virtual cameras")

@@ -16,7 +16,7 @@ from v2v_pictures.sheet import draw_sheet
 from v2v_protocol.command import Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.programs import show
-from v2v_protocol.sample import ARRAYS, DEFAULT_ARRAYS
+from v2v_protocol.sample import ARRAYS, DEFAULT_ARRAYS, SampleParams
 from v2v_protocol.spec_flags import add_spec
 from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_recordings.writers import ENDINGS, check_form, form_of, write_events
@@ -101,9 +101,14 @@ def _run(asked: argparse.Namespace) -> None:
     show(
         f"{provenance.video} from frame {provenance.start_frame}: "
         + ", ".join(f"{name} {array.dtype}{list(array.shape)}" for name, array in sample.arrays.items())
-        + f"; thresholds +{params.threshold_pos:.3f} -{params.threshold_neg:.3f}, noise {params.noise_sigma:.3f}, "
-        f"{params.hot_pixel_count} hot pixels, {provenance.saturated_bins} bins saturated; written to {asked.out}"
+        + ("; recorded events, " if provenance.is_recorded else _drawn(params))
+        + f"{provenance.saturated_bins} bins saturated; written to {asked.out}"
     )
+
+
+def _drawn(params: SampleParams) -> str:
+    thresholds = f"; thresholds +{params.threshold_pos:.3f} -{params.threshold_neg:.3f}"
+    return f"{thresholds}, noise {params.noise_sigma:.3f}, {params.hot_pixel_count} hot pixels, "
 
 
 if __name__ == "__main__":

@@ -80,7 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "Make the events of whole videos: full frame, whole length, one recording for each video.",
         [
             "v2v-simulate --whole clip.mp4 --out events/ --events h5",
-            "v2v-simulate --whole videos/ --out events/ --events raw --recipe davis346 --jobs 4",
+            "v2v-simulate --whole videos/ --out events/ --events raw --recipe davis346-measured --jobs 4",
         ],
     )  # fmt: skip
     which = add_corpus(parser, "Which videos", "a video, a folder of videos, or a list file")
@@ -98,7 +98,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(asked: argparse.Namespace) -> int:
     """Make a recording of each video that has none; return the exit status."""
     spec = asked_spec(asked)
-    if kind_from(vars(asked)).is_view:
+    kind = kind_from(vars(asked))
+    if not kind.is_simulated:
+        raise UsageError(f"--whole with {kind.name}: they have events of their own, in their raw files")
+    if kind.is_view:
         raise UsageError(
             "--whole with photographs: a photograph has no length, and its motion is drawn for each sample; write "
             "samples of them with --count N, as long as --set voxels_per_clip=N says"

@@ -2,7 +2,8 @@
 
 1. Figures are means over two kinds of data that no candidate was trained on: the recordings of `python -m bench
    recordings`, and `worlds`, photographs that move, as `python -m bench learn` draws them. Both weigh the same.
-2. A network is out if its squared error is not below that of a constant grey, the mean grey of each picture.
+2. A network is out if its squared error is not below that of a constant grey: one for all pictures of a kind, their
+   mean. The mean of each picture would be no fair measure, because events do not say how bright a picture is.
 3. Of the others, a network is out if its correlation is more than 0.05 below the best one's.
 4. Of those that are left, the one with the lowest LPIPS ships.
 
@@ -17,6 +18,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from torch import Tensor
 
 from bench.accuracy.learn import score
@@ -68,9 +70,22 @@ def apply(figures: Mapping[str, Mapping[str, float]]) -> Verdict:
     return Verdict(ships, out)
 
 
-def grey_mse(_prediction: GreyImage, target: GreyImage) -> float:
-    """Return the squared error of a blank in the mean grey of the target [H, W]: a metric that needs no network."""
-    return float(target.var())
+def _grey(_prediction: GreyImage, target: GreyImage) -> float:
+    """Return the mean of the target [H, W]: a metric that needs no network."""
+    return float(target.mean())
+
+
+def _square(_prediction: GreyImage, target: GreyImage) -> float:
+    """Return the mean of the target's squares."""
+    return float(np.square(target, dtype=np.float64).mean())
+
+
+def with_grey_mse(means: Mapping[str, float]) -> dict[str, float]:
+    """Return mean metrics with ``grey_mse`` in place of ``grey`` and ``square``: the squared error of one grey for all
+    pictures, their mean.
+    """
+    found = dict(means)
+    return found | {"grey_mse": found.pop("square") - found.pop("grey") ** 2}
 
 
 def on_recordings(
@@ -83,14 +98,14 @@ def on_recordings(
         published: take interpolated voxel grids, as published FireNet does.
 
     Returns:
-        The mean over the recordings of each metric and of :func:`grey_mse`; and the same over all scored windows, by
-        the number of grids since the start, as far as there are any.
+        The mean over the recordings of each metric, and the squared error of a constant grey, ``grey_mse``; and the
+        same over all scored windows, by the number of grids since the start, as far as there are any.
 
     Raises:
         UsageError: no window ends at a picture.
     """
     settings = VoxelSettings(bins=network.bins, kind="interpolated" if published else "discrete")
-    every = {**metrics, "grey_mse": grey_mse}
+    every = {**metrics, "grey": _grey, "square": _square}
     run = Run(network, settings, every, window_events=window_events, score_blank=False)
     (data_set,) = folder_config(folder).data_sets
     scores = [evaluate_sequence(run, path, data_set) for path in find_recordings(folder, data_set).values()]
@@ -103,15 +118,15 @@ def on_recordings(
         among = [{name: window[name] for name in every} for window in windows if first <= window["frame"] < end]
         if among:
             name = f"grids {first + 1} to {end}" if end < math.inf else f"grids from {first + 1}"
-            by_grids[name] = {"windows": len(among), **mean_by_name(among)}
-    return mean_over_sequences(scored), by_grids
+            by_grids[name] = {"windows": len(among), **with_grey_mse(mean_by_name(among))}
+    return with_grey_mse(mean_over_sequences(scored)), by_grids
 
 
 def on_worlds(samples: tuple[Tensor, Tensor], network: VoxelNetwork, metrics: Mapping[str, Metric]) -> dict[str, float]:
     """Score a network on samples of `bench learn`: voxels [N, T, bins, H, W] and frames [N, T, 1, H, W], 0 .. 1."""
     voxels, frames = samples
-    variance = frames[:, frames.shape[1] // 2 :].var(dim=(-2, -1), correction=0).mean()
-    return score(network.forward_sequence, voxels, frames, metrics) | {"grey_mse": float(variance)}
+    grey_mse = frames[:, frames.shape[1] // 2 :].var(correction=0)
+    return score(network.forward_sequence, voxels, frames, metrics) | {"grey_mse": float(grey_mse)}
 
 
 def mean_of(kinds: Sequence[Mapping[str, float]], lpips: str) -> dict[str, float]:

@@ -8,7 +8,15 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from v2v_protocol.recipe import EFFECTS_SECTION, PRESET_FIELDS, STREAM_PRESETS, WORLDS_SECTION, Recipe
+from v2v_protocol.recipe import (
+    EFFECTS_SECTION,
+    LISTED,
+    PRESET_FIELDS,
+    RECORDED_SECTION,
+    STREAM_PRESETS,
+    WORLDS_SECTION,
+    Recipe,
+)
 from v2v_protocol.settings import Setting, settings_of
 from v2v_protocol.spec import StreamSpec
 from v2v_server.config import ServeConfig
@@ -55,6 +63,7 @@ SOURCES = dict.fromkeys(
     "start": _CODE,
     "rate_draw": _OURS,
     **{name: _OURS for name, setting in settings_of(Recipe).items() if setting.group == WORLDS_SECTION},
+    **{name: _CODE for name, setting in settings_of(Recipe).items() if setting.group == RECORDED_SECTION},
 }  # fmt: skip
 """The source of a recipe's field and its default; those of the effects are on another page."""
 
@@ -79,7 +88,7 @@ def page() -> str:
         *_section("Recipe", Recipe),
         *_sources(),
         "### Recipes by name\n",
-        *_presets(PRESET_FIELDS, "recipe"),
+        *_presets({name: PRESET_FIELDS[name] for name in LISTED}, "recipe"),
     ])  # fmt: skip
 
 

@@ -21,6 +21,8 @@ from av.video.stream import VideoStream
 from PIL import Image
 
 from tests.clips import write_clip
+from v2v_recordings.block_file import EventFileWriter
+from v2v_recordings.items import EventChunk, FlowField, Picture, SensorSize
 
 Longs = npt.NDArray[np.int64]
 HEIGHT_PX, WIDTH_PX = 64, 96
@@ -129,6 +131,25 @@ def write_photographs(folder: Path) -> None:
     for key, name in enumerate(("a.png", "b.png"), 5):
         tiles, texture = _level(row // 11, column // 13, key), _level(row // 2, column // 2, key + 9)
         Image.fromarray(((tiles * 3 + texture) // 4).astype(np.uint8)).save(folder / name)
+
+
+def write_recordings(folder: Path) -> Path:
+    """Write two recordings in the form that is served: with pictures and true flow; return the folder."""
+    for name, key in (("a.v2ve", 5), ("b.v2ve", 8)):
+        number = np.arange(6000, dtype=np.int64)
+        times = np.cumsum(1000 * (_level(number, number, key) % 7)) + 13_000_000
+        place = _level(number // 2, number, key + 1) * 256 + _level(number, number // 3, key + 2)
+        x, y, brighter = place % WIDTH_PX, place // WIDTH_PX % HEIGHT_PX, place % 5 < 2
+        marks = np.linspace(times[0] - 1000, times[-1], 12).astype(np.int64)
+        with EventFileWriter(folder / name, source=name, fingerprint="", origin_ns=0) as writer:
+            writer.add(SensorSize(WIDTH_PX, HEIGHT_PX))
+            writer.add(EventChunk(times, x, y, brighter))
+            for mark, picture in zip(marks.tolist(), zooming(12)[0], strict=True):
+                writer.add(Picture(mark, picture))
+                flow = np.stack([picture, 255 - picture]).astype(np.float32) / 64
+                flow[:, picture % 17 == 0] = np.nan
+                writer.add(FlowField(mark, flow))
+    return folder
 
 
 def boxes_text(frames: int) -> str:

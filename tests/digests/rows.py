@@ -18,13 +18,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tests.digests.clips import write_clips, write_lossy, write_photographs
+from tests.digests.clips import write_clips, write_lossy, write_photographs, write_recordings
 from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_SEED, Sample
 from v2v_protocol.spec import StreamSpec
 from v2v_server.broker.leases import Request
 from v2v_server.corpus.catalogue import Catalogue, open_catalogue
-from v2v_server.kinds.photographs import PhotographKind
-from v2v_server.kinds.videos import VideoKind
+from v2v_server.kinds.registry import KINDS, VIDEOS
 from v2v_server.prepare import prepare
 from v2v_server.schedule import Schedule, SequenceTable
 from v2v_server.store.cache import Cache, make_cache
@@ -51,6 +50,7 @@ class Row:
         spec: fields beside the recipe.
         count: number of samples, from index 0 on.
         seed, epoch: of these samples.
+        kind: of the videos.
     """
 
     recipe: str | Mapping[str, Any] = field(default_factory=dict)
@@ -59,6 +59,7 @@ class Row:
     count: int = 3
     seed: int = 11
     epoch: int = 0
+    kind: str = "videos"
 
     @property
     def stream(self) -> StreamSpec:
@@ -84,6 +85,7 @@ PORTABLE: Mapping[str, Row] = {
     "sensor": Row("sensor"),
     "davis346": Row("davis346", (*_EVENTS, "frames")),
     "davis346-running": Row("davis346-running", (*_EVENTS, "frames")),
+    "davis346-measured": Row("davis346-measured", (*_EVENTS, "frames")),
     "natural-davis346": Row(spec={"preset": "natural-davis346"}, count=9),
     "balanced": Row(spec={"preset": "balanced", "sibling_spacing": 2}),
     "natural": Row(spec={"preset": "natural"}, count=9),
@@ -121,14 +123,20 @@ PORTABLE: Mapping[str, Row] = {
     "substep_px of deep light": Row(FINE | {"light": "declared"}, ("voxels",), {"substep_px": 0.25, **AUTO}, count=6),
     "scene": Row({}, ("voxels", "frames", "frames_rgb", "boxes"), AUTO | {"still_share": 0.5}, count=6),
     "keep_defects": Row({}, spec=AUTO | {"keep_defects": "bars,cuts,duplicates"}, count=6),
-    "worlds": Row("worlds", ("voxels", "frames", *_TRUTH), count=6),
+    "worlds": Row("worlds", ("voxels", "frames", *_TRUTH), count=6, kind="photographs"),
     "exposure_seconds": Row({"exposure_seconds": (0.2, 0.4)}, ("voxels", "frames", "frames_blurred"), count=6),
     "exposure_seconds of photographs": Row(
         {"preset": "worlds-fine", "exposure_seconds": (0.005, 0.05), "world_speed_px": (200.0, 600.0)},
         ("voxels", "frames_blurred", *_TRUTH),
         count=6,
+        kind="photographs",
     ),
-    "worlds-fine": Row({"preset": "worlds-fine", "contrast_probability": 0.5}, ("voxels", "frames_u16"), count=6),
+    "worlds-fine": Row(
+        {"preset": "worlds-fine", "contrast_probability": 0.5},
+        ("voxels", "frames_u16"),
+        count=6,
+        kind="photographs",
+    ),
     "worlds with sub-steps": Row(
         FINE
         | {
@@ -142,6 +150,33 @@ PORTABLE: Mapping[str, Row] = {
         (*_EVENTS, "frames_all", *_TRUTH),
         {"substep_px": 0.5, "flow_direction": "backward"},
         count=6,
+        kind="photographs",
+    ),
+    "recordings": Row(
+        "recordings", (*_EVENTS, "time_surface", "frames", "flow", "flow_valid"), count=6, kind="recordings"
+    ),
+    "recordings with noise": Row(
+        {
+            "preset": "recordings",
+            "bin_span": "events",
+            "added_sigma": (0.1, 0.3),
+            "added_hot_share": 0.01,
+            "added_hot_sigma": (0.0, 2.0),
+            "pause_probability": 0.4,
+            "pause_stay_probability": 0.4,
+            "grids_per_frame": 2,
+            "frame_stride": 2,
+        },
+        (*_EVENTS, "frames_all"),
+        {"voxel_dtype": "float32"},
+        count=4,
+        kind="recordings",
+    ),
+    "recordings of a duration": Row(
+        {"preset": "recordings", "grids_per_frame": 0, "voxel_seconds": 0.0015, "lead_frames": 1, "lead_voxels": 1},
+        (*_EVENTS, "frames"),
+        count=2,
+        kind="recordings",
     ),
     "quiet_share": Row({}, spec=AUTO | {"quiet_share": 0.3, "moving_share": 1.0, "substep_px": 1.0}, count=6),
 }
@@ -198,6 +233,7 @@ class Ways:
         if lossy:
             write_lossy(self.videos / "d.avi")
         write_photographs(folder / "photographs")
+        write_recordings(folder / "recordings")
         self._catalogues: dict[str, Catalogue] = {}
         self.all: Mapping[str, Callable[[Row], Made]] = {
             "video": self._plain("videos"),
@@ -208,8 +244,8 @@ class Ways:
         }
 
     def of(self, row: Row) -> Mapping[str, Callable[[Row], Made]]:
-        """Return the ways of a row: all, or the one of photographs."""
-        return {"video": self._plain("photographs")} if row.stream.recipe.is_world else self.all
+        """Return the ways of a row: all, or the one of a kind that is neither stored nor cached."""
+        return self.all if row.kind == VIDEOS.name else {"video": self._plain(row.kind)}
 
     def close(self) -> None:
         """Close the catalogues."""
@@ -219,10 +255,11 @@ class Ways:
     def catalogue(self, name: str) -> Catalogue:
         """Return the catalogue of the videos, or of a store of this size, which is written first."""
         if name not in self._catalogues:
-            is_video = name != "photographs"
-            if name not in ("videos", "photographs"):
+            kind = KINDS.get(name, VIDEOS)
+            is_video = kind == VIDEOS
+            if name not in KINDS:
                 self._prepare(name)
-            rows, kind = ROWS if name == "videos" else None, VideoKind() if is_video else PhotographKind()
+            rows = ROWS if name == "videos" else None
             self._catalogues[name] = open_catalogue(
                 self.folder / name, rows=rows, cache_dir=self.folder, processes=0, scene=is_video, kind=kind
             )
@@ -239,7 +276,7 @@ class Ways:
     def _plain(self, name: str) -> Callable[[Row], Made]:
         def make(row: Row) -> Made:
             samples = samples_of(self.catalogue(name), row)
-            if name not in ("videos", "photographs"):
+            if name not in KINDS:
                 assert all(sample.provenance.decoder.endswith(", from the store") for sample in samples)
             return made(samples)
 

@@ -17,7 +17,7 @@ import pytest
 
 from tests.clips import panned_luma, write_clip
 from tests.packed import packed_forms
-from tests.stream.conftest import SMALL, SMALL_FLAGS, digest, epoch_of, server_workers
+from tests.stream.conftest import SMALL, SMALL_FLAGS, Corpus, digest, epoch_of, server_workers
 from tests.waiting import has_ended, until
 from v2v_client import Batch, V2VStreamDataset
 from v2v_client.local_server import LocalServer
@@ -32,10 +32,12 @@ pytestmark = pytest.mark.slow
 
 
 @contextmanager
-def _faulty(monkeypatch: pytest.MonkeyPatch, videos: Path, *flags: str, **fault: Any) -> Iterator[LocalServer]:
+def _faulty(
+    monkeypatch: pytest.MonkeyPatch, videos: Path, *flags: str, flags_of: tuple[str, ...] = SMALL_FLAGS, **fault: Any
+) -> Iterator[LocalServer]:
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (str(INJECT), os.environ.get("PYTHONPATH")))))
     monkeypatch.setenv("V2V_FAULT", json.dumps(fault))
-    with LocalServer(videos, workers=2, flags=[*SMALL_FLAGS, *flags]) as server:
+    with LocalServer(videos, workers=2, flags=[*flags_of, *flags]) as server:
         yield server
 
 
@@ -115,6 +117,17 @@ def test_a_death_without_blame_changes_nothing(
     assert once.exists()
 
 
+def test_a_death_while_a_video_of_any_kind_is_read_changes_nothing(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, corpus: Corpus
+) -> None:
+    with LocalServer(corpus.folder, workers=2, flags=corpus.flags) as server:
+        undisturbed = [digest(batch) for batch in epoch_of(server.address, recipe=corpus.recipe)]
+    fault: dict[str, Any] = {"stage": "decode", "action": "SIGKILL", "once": str(tmp_path / "done")}
+    with _faulty(monkeypatch, corpus.folder, flags_of=corpus.flags, **fault) as server:
+        assert [digest(batch) for batch in epoch_of(server.address, recipe=corpus.recipe)] == undisturbed
+    assert (tmp_path / "done").exists()
+
+
 @pytest.mark.parametrize("stage", ["simulate", "send"])
 def test_a_stopped_worker_changes_nothing(
     monkeypatch: pytest.MonkeyPatch, clips: Path, tmp_path: Path, reference: list[str], stage: str
@@ -174,11 +187,13 @@ def test_a_crash_moves_its_own_index_only_and_is_written_down(
         assert again.provenance.candidate == 1
 
 
-def test_a_poison_video_is_quarantined_and_stays_so(monkeypatch: pytest.MonkeyPatch, clips: Path, cache: Path) -> None:
-    poison = "deep/c.mp4"
-    fault = {"stage": "decode", "action": "SIGSEGV", "video": poison}
-    with _faulty(monkeypatch, clips, "--cache-dir", str(cache), **fault) as server:
-        first = [batch for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch)]
+def test_a_poison_video_is_quarantined_and_stays_so(
+    monkeypatch: pytest.MonkeyPatch, corpus: Corpus, cache: Path
+) -> None:
+    poison = corpus.one
+    fault: dict[str, Any] = {"stage": "decode", "action": "SIGSEGV", "video": poison, "flags_of": corpus.flags}
+    with _faulty(monkeypatch, corpus.folder, "--cache-dir", str(cache), **fault) as server:
+        first = [batch for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch, recipe=corpus.recipe)]
         said = server.last_lines()
     assert "quarantine" in said
     videos = {item.video for batch in first for item in batch.provenance}
@@ -188,9 +203,9 @@ def test_a_poison_video_is_quarantined_and_stays_so(monkeypatch: pytest.MonkeyPa
     # Both workers may have been at it when the second verdict fell; after that it is not leased.
     assert 2 <= len(verdicts) <= 4
 
-    with _faulty(monkeypatch, clips, "--cache-dir", str(cache), **fault) as server:
+    with _faulty(monkeypatch, corpus.folder, "--cache-dir", str(cache), **fault) as server:
         pids = {worker.pid for worker in server_workers(server.pid)}
-        again = [batch for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch)]
+        again = [batch for epoch in (0, 1) for batch in epoch_of(server.address, epoch=epoch, recipe=corpus.recipe)]
         assert {worker.pid for worker in server_workers(server.pid)} == pids
     assert {item.quarantine for batch in again for item in batch.provenance} == {len(verdicts)}
 

@@ -27,6 +27,8 @@ START_LOG_UNITS = 0.06
 PHOTOGRAPHS = ("camera", "coffee", "coins")
 OTHERS = ("gravel", "parallax", "occlusion", "rotation", "zoom", "plain", "thin", "flicker")
 NAMES = (*PHOTOGRAPHS, *OTHERS)
+SMALL = ("insects", "rain")
+"""Scenes of things that are smaller than a block."""
 _LONGEST_SECONDS, _PATH_HZ = 4.0, 9600
 _FLICKER_HZ, _FLICKER_SHARE = 10.0, 0.3
 
@@ -52,7 +54,7 @@ class RenderedScene:
     """A scene.
 
     Attributes:
-        name: of NAMES.
+        name: see :func:`rendered_scene`.
         light: the picture [height, width], 0 .. 1, of a time in seconds (0 .. 4).
     """
 
@@ -77,9 +79,11 @@ def log_levels(light: Reals) -> Reals:
     return levels
 
 
-def counts_of(levels: Reals, seconds: Reals, edges_seconds: Reals, threshold: float) -> Counts:
-    """Return the events of [n, pixels] log intensities at [n] times, linear in between."""
-    start = np.full(levels.shape[1], START_LOG_UNITS)
+def counts_of(
+    levels: Reals, seconds: Reals, edges_seconds: Reals, threshold: float, start: Reals | float = START_LOG_UNITS
+) -> Counts:
+    """Return the events of [n, pixels] log intensities at [n] times, linear in between, from residuals [pixels]."""
+    start = np.broadcast_to(start, levels.shape[1])
     events = dense_events(levels, seconds, start, threshold, threshold)
     return Counts(*(_binned(events, sign, edges_seconds, levels.shape[1]) for sign in (1, -1)))
 
@@ -95,17 +99,26 @@ def errors(made: Counts, true: Counts) -> Errors:
     )
 
 
-def rendered_scene(name: str, height: int, width: int, px_per_second: float) -> RenderedScene:
+def rendered_scene(
+    name: str,
+    height: int,
+    width: int,
+    px_per_second: float,
+    behind: str = "camera",
+    shown: str | None = None,
+) -> RenderedScene:
     """Return a scene.
 
     Args:
-        name: of NAMES.
+        name: of NAMES or SMALL, "discs", or a photograph of scikit-image, which passes.
         height, width: of the picture, px.
         px_per_second: speed; of the fastest part, where parts differ.
+        behind: the photograph that rests in "occlusion", "discs" and SMALL.
+        shown: the photograph that moves in "occlusion", "rotation" and "zoom"; None: the scene's own.
     """
     y, x = np.mgrid[0:height, 0:width].astype(np.float64)
     y, x = y - (height - 1) / 2, x - (width - 1) / 2
-    reach = max(height, width) / 2
+    reach, rests = max(height, width) / 2, photo(behind, y, x)
 
     def moved(seconds: float, share: float = 1.0) -> tuple[Reals, Reals]:
         down, right = path(seconds) * px_per_second * share
@@ -120,15 +133,17 @@ def rendered_scene(name: str, height: int, width: int, px_per_second: float) -> 
         front = moved(seconds)
         radius = np.hypot(front[0] / (0.5 * reach), front[1] / (0.35 * reach))
         cover = np.clip(0.5 + (1.0 - radius) * 0.35 * reach, 0.0, 1.0)
-        return photo("camera", y, x) * (1 - cover) + photo("coffee", *front) * cover
+        return rests * (1 - cover) + photo(shown or "coffee", *front) * cover
 
     def rotation(seconds: float) -> Reals:
         angle = px_per_second * seconds / reach
-        return photo("coffee", y * math.cos(angle) - x * math.sin(angle), y * math.sin(angle) + x * math.cos(angle))
+        return photo(
+            shown or "coffee", y * math.cos(angle) - x * math.sin(angle), y * math.sin(angle) + x * math.cos(angle)
+        )
 
     def zoom(seconds: float) -> Reals:
         smaller = math.exp(-px_per_second * seconds / reach)
-        return photo("coins", y * smaller, x * smaller)
+        return photo(shown or "coins", y * smaller, x * smaller)
 
     def plain(seconds: float) -> Reals:
         down, right = moved(seconds)
@@ -150,9 +165,43 @@ def rendered_scene(name: str, height: int, width: int, px_per_second: float) -> 
         lamp = 1.0 - _FLICKER_SHARE * (0.5 + 0.5 * math.sin(2 * math.pi * _FLICKER_HZ * seconds))
         return photo("coffee", *moved(seconds)) * lamp
 
+    def wrapped(at: Reals, period: float) -> Reals:
+        inside: Reals = (at + period / 2) % period - period / 2
+        return inside
+
+    def discs(seconds: float) -> Reals:
+        picture = rests.copy()
+        for number, (row, column) in enumerate(((-0.6, -0.4), (0.1, 0.7), (0.6, -0.3))):
+            radius, place = (0.34 - 0.06 * number) * reach, path(seconds + number / 3) * px_per_second
+            down, right = (
+                wrapped(at - share * reach - way, side + 2 * radius + 4)
+                for at, share, way, side in zip((y, x), (row, column), place, (height, width), strict=True)
+            )
+            cover = np.clip(0.5 + radius - np.hypot(down, right), 0.0, 1.0)
+            picture += (0.15 + 0.37 * number - picture) * cover
+        return picture
+
+    def insects(seconds: float) -> Reals:
+        picture, random = rests.copy(), np.random.default_rng(1)
+        for row, column, heading, share in random.uniform(-0.5, 0.5, (round(height * width / 400), 4)):
+            ahead, aside = path(seconds + column + 0.5) * px_per_second * (0.75 + share / 2)
+            cosine, sine = math.cos(2 * math.pi * heading), math.sin(2 * math.pi * heading)
+            down = wrapped(y[:, :1] - row * height - (ahead * cosine - aside * sine), height + 12)
+            right = wrapped(x[:1] - column * width - (ahead * sine + aside * cosine), width + 12)
+            picture *= 1.0 - 0.9 * np.exp(-0.5 * down**2) * np.exp(-0.5 * right**2)
+        return picture
+
+    def rain(seconds: float) -> Reals:
+        picture, random = rests.copy(), np.random.default_rng(2)
+        for row, column, share in random.uniform(-0.5, 0.5, (round(height * width / 300), 3)):
+            down = wrapped(y[:, :1] - row * height - seconds * px_per_second * (1 + 0.4 * share), height + 40)
+            cover = 0.5 * np.exp(-0.5 * (down / 4.0) ** 2) * np.exp(-0.5 * ((x[:1] - column * width) / 0.7) ** 2)
+            picture += (0.85 - picture) * cover
+        return picture
+
     kinds = {
         "parallax": parallax, "occlusion": occlusion, "rotation": rotation, "zoom": zoom, "plain": plain,
-        "thin": thin, "flicker": flicker,
+        "thin": thin, "flicker": flicker, "discs": discs, "insects": insects, "rain": rain,
     }  # fmt: skip
     return RenderedScene(name, kinds.get(name) or (lambda seconds: photo(name, *moved(seconds))))
 

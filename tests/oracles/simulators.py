@@ -12,9 +12,11 @@ from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec, module_from_spec
+from itertools import pairwise
 from types import ModuleType
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -36,19 +38,23 @@ _WIDEST_OFFSET_SECONDS = 0.004
 _MOST_STEPS, _MOST_COUNT, _DARK = 32, 5, 0.03
 ROWS = 16
 """Peers get the pixels as pictures of this height: the number of pixels is a multiple of it."""
+_STILL_PX, _STILL_GREYS = 9, 2
 GAPS = len(INTERVAL_EDGES_US) - 1
-SUMS = 4 * 6 + 4 + 2 * GAPS
+SUMS = 4 * 6 + 4 + 3 + 2 * GAPS
 """Six sums for each of four pairs of maps: pixels, both sums, both sums of squares, products. Then pixels of which the
-sensor's activity is missed, that it has active, whose activity is invented, that the simulation has active. Then
-intervals between events by their length, simulated and recorded.
+sensor's activity is missed, that it has active, whose activity is invented, that the simulation has active. Then the
+seconds of pixels whose frames are still, and their events, simulated and recorded. Then intervals between events by
+their length, simulated and recorded.
 """
 SIMULATED, RECORDED = [7, 13], [8, 14]
 """Sums of the darker and of the brighter events, simulated and recorded."""
 FIGURES = (
-    "correlation", "darker", "brighter", "mirrored", "log_ratio", "ratio", "intervals", "missed", "invented"
+    "correlation", "darker", "brighter", "mirrored", "log_ratio", "ratio", "intervals", "missed", "invented",
+    "still_hz", "sensor_still_hz",
 )  # fmt: skip
 """Correlations of signed, darker and brighter events, and of signed events with the sensor's mirrored; |log ratio| of
-the numbers of events, its sign kept; distance of the distributions of intervals; shares of active pixels.
+the numbers of events, its sign kept; distance of the distributions of intervals; shares of active pixels; events a
+second of a pixel whose frames are still, simulated and recorded.
 """
 Simulator = Callable[[Recorded, float, int], Recorded]
 """From a recording, a threshold (0: the camera's own) and a seed to its simulation."""
@@ -225,6 +231,19 @@ def correlation(one: Doubles, other: Doubles) -> float:
     return float(np.corrcoef(one, other)[0, 1]) if one.std() and other.std() else 0.0
 
 
+def is_unchanged(given: Recorded) -> npt.NDArray[np.bool_]:
+    """Return in which steps no pixel around one changes by more than the noise of frames: [steps, pixels].
+
+    Frames alone decide: what chose pixels by their events would find quiet ones.
+    """
+    around, found = np.ones((_STILL_PX, _STILL_PX), np.uint8), []
+    change = np.full((given.height_px, given.width_px), 255, np.uint8)  # of pixels that are not kept
+    for before, after in pairwise(given.frames.astype(np.int16)):
+        change.flat[given.pixels] = np.abs(after - before)
+        found.append(cv2.dilate(change, around).flat[given.pixels] <= _STILL_GREYS)
+    return np.stack(found)
+
+
 def tallied(given: Recorded, true: Doubles, made: Recorded) -> Doubles:
     """Return the sums that figures rest on, by block of the sensor and step: [SIDE**2, steps, :data:`SUMS`].
 
@@ -244,6 +263,9 @@ def tallied(given: Recorded, true: Doubles, made: Recorded) -> Doubles:
     ]  # fmt: skip
     active, seen_active = found.sum(axis=0) > 0, true.sum(axis=0) > 0
     columns += [seen_active & ~active, seen_active, active & ~seen_active, active]
+    still = is_unchanged(given)
+    seconds = 1e-6 * np.diff(given.frame_us)[:, None]
+    columns += [still * each for each in (seconds, found.sum(axis=0), true.sum(axis=0))]
     table = np.stack(columns, axis=2).astype(np.float64)
     gaps = np.concatenate([_gaps_of(each, blocks, len(real)) for each in (made, given)], axis=2)
     return np.concatenate([np.stack([sums_by_block(blocks, step) for step in table], axis=1), gaps], axis=2)
@@ -267,10 +289,14 @@ def figures(sums: Doubles) -> Doubles:
     alike = np.where(spread > 1e-9, (count * both - one * other) / np.sqrt(np.maximum(spread, 1e-9)), 0.0)
     missed, seen, invented, active = np.moveaxis(sums[..., 24:28], -1, 0)
     ratio = np.log((one[..., 1] + one[..., 2] + 0.5) / (other[..., 1] + other[..., 2] + 0.5))
-    gaps = sums[..., 28:].reshape(*sums.shape[:-1], 2, GAPS)
+    seconds, made_still, seen_still = np.moveaxis(sums[..., 28:31], -1, 0)
+    gaps = sums[..., 31:].reshape(*sums.shape[:-1], 2, GAPS)
     shares = gaps / np.maximum(gaps.sum(axis=-1, keepdims=True), 1.0)
     apart = np.abs(shares[..., 0, :] - shares[..., 1, :]).sum(axis=-1) / 2
-    rest = (np.abs(ratio), ratio, apart, missed / np.maximum(seen, 1.0), invented / np.maximum(active, 1.0))
+    rest = (
+        np.abs(ratio), ratio, apart, missed / np.maximum(seen, 1.0), invented / np.maximum(active, 1.0),
+        *(events / np.maximum(seconds, 1e-9) for events in (made_still, seen_still)),
+    )  # fmt: skip
     return np.concatenate([alike, np.stack(rest, axis=-1)], axis=-1)
 
 

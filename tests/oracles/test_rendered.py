@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.oracles.rendered import NAMES, counts_of, errors, log_levels, rendered_scene
+from tests.oracles.rendered import NAMES, SMALL, counts_of, errors, log_levels, rendered_scene
 
 EDGES = np.arange(4) / 30
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, *SMALL, "discs", "astronaut"])
 def test_frames_of_a_high_rate_come_near_to_the_truth(name: str) -> None:
     """And every bin conserves: what fires is the change of the levels, up to a threshold."""
     scene = rendered_scene(name, 24, 32, 60.0)

@@ -14,8 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from v2v_protocol.errors import RecipeError
-from v2v_protocol.recipe import PRESETS, Recipe, preset
+from v2v_protocol.recipe import DEPRECATED, PRESETS, Recipe, preset
 from v2v_protocol.settings import settings_of
+from v2v_protocol.spec import StreamSpec
 
 FIELDS = {field.name: field.default for field in dataclasses.fields(Recipe)}
 WHOLE = [name for name, default in FIELDS.items() if type(default) is int]
@@ -250,6 +251,20 @@ def test_the_recipes_by_name_are_real_cameras(name: str) -> None:
     said: list[str] = []
     PRESETS[name].warn(said.append)
     assert not said
+
+
+def test_a_deprecated_recipe_is_read_with_one_warning_and_not_listed(caplog: pytest.LogCaptureFixture) -> None:
+    for name, successor in DEPRECATED.items():
+        read = [Recipe.from_dict({"preset": name, "bins": 3}), StreamSpec.from_dict({"recipe": name}).recipe]
+        assert read == [PRESETS[name].replace(bins=3), PRESETS[name]]
+        [line] = caplog.messages
+        assert line == (f"warning: recipe {name} is deprecated: give {successor}. Samples of {name} stay as they are.")
+        caplog.clear()
+        preset(successor)
+        assert not caplog.messages
+    with pytest.raises(RecipeError) as refused:
+        preset("unknown")
+    assert re.findall("sensor|davis346(?!-)", str(refused.value)) == []
 
 
 @pytest.fixture(autouse=True)

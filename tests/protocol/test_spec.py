@@ -46,6 +46,10 @@ OTHER_RECIPE_VALUES: dict[str, Any] = {
     "exposure_seconds": (0.001, 0.01),
     "world_bits": 16,
     "world_change_share": 0.5,
+    "bin_span": "events",
+    "added_sigma": [0.0, 0.1],
+    "added_hot_share": [0.0, 0.001],
+    "added_hot_sigma": [0.0, 0.1],
     "track_points": 32,
     "contrast_probability": 0.1,
     "contrast_scale": [1.0, 2.0],
@@ -103,8 +107,10 @@ PRESET_DIGESTS = {
     "sensor": "977bcf963b48c05e7d8e251e735137db",
     "davis346": "c52d5b5342fc135b5676b3a5116ece57",
     "davis346-running": "1de5b42d34b14b580736c38330ca12b3",
+    "davis346-measured": "4a6cb6039d26a7215cb2153ab99014ed",
     "worlds": "71b398f70f04d63139ff2eb79b61849d",
     "worlds-fine": "b426778d302c145883f2b6cdfb1f9d22",
+    "recordings": "b3dee5cae311f3e3b51e111a51b9bbac",
 }
 """No preset changes its meaning: new behaviour gets a new name."""
 

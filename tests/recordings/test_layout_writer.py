@@ -16,9 +16,10 @@ from hypothesis import strategies as st
 
 from trainer.convert import cli
 from v2v_protocol.errors import UsageError
-from v2v_recordings import layout_writer as writer_module
+from v2v_recordings import item_writer
+from v2v_recordings.item_writer import Written
 from v2v_recordings.items import EventChunk, Item, Picture, SensorSize
-from v2v_recordings.layout_writer import RecordingWriter, Written
+from v2v_recordings.layout_writer import RecordingWriter
 from v2v_recordings.reading import FORMS, RawForm
 
 
@@ -56,8 +57,8 @@ def test_pictures_are_paired_and_late_events_sorted_whatever_the_chunks(
         items.insert(data.draw(st.integers(0, len(items))), picture(time))
     path = tmp_path_factory.mktemp("writer") / "a.h5"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(writer_module, "FLUSH_EVENTS", 5)
-        patch.setattr(writer_module, "REORDER_EVENTS", 4)
+        patch.setattr(item_writer, "FLUSH_EVENTS", 5)
+        patch.setattr(item_writer, "REORDER_EVENTS", 4)
         written = write(path, items)
     assert written.events == len(times)
     with h5py.File(path) as file:
@@ -73,8 +74,8 @@ def test_pictures_are_paired_and_late_events_sorted_whatever_the_chunks(
 
 
 def test_events_later_than_the_buffer_reaches_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(writer_module, "FLUSH_EVENTS", 4)
-    monkeypatch.setattr(writer_module, "REORDER_EVENTS", 2)
+    monkeypatch.setattr(item_writer, "FLUSH_EVENTS", 4)
+    monkeypatch.setattr(item_writer, "REORDER_EVENTS", 2)
     with pytest.raises(UsageError, match=r"goes back by 2\.000000 s over more than 2 events"):
         write(tmp_path / "a.h5", [chunk([10**10 + i for i in range(8)]), chunk([8 * 10**9] * 6)])
     assert list(tmp_path.iterdir()) == []

@@ -6,16 +6,17 @@ import hashlib
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import psutil
 import pytest
 from torch.utils.data import DataLoader
 
 from tests.clips import damaged, panned_luma, write_clip
+from tests.digests.clips import write_recordings
 from v2v_client import Batch, V2VDataset, V2VStreamDataset
 from v2v_client.local_server import LocalServer
-from v2v_protocol.recipe import Recipe
+from v2v_protocol.recipe import Recipe, preset
 from v2v_server.corpus.catalogue import open_catalogue
 
 SMALL = Recipe(voxels_per_clip=4, bins=5, crop_height_px=32, crop_width_px=40)
@@ -61,6 +62,29 @@ def server(request: pytest.FixtureRequest, clips: Path) -> Iterator[LocalServer]
     workers = 1 if request.node.name.endswith("faults") else 2
     with LocalServer(clips, workers=workers, flags=SMALL_FLAGS) as running:
         yield running
+
+
+class Corpus(NamedTuple):
+    """Videos of a kind, flags of their server, a recipe that they give sequences of, and one of them."""
+
+    folder: Path
+    one: str
+    kind: str = "videos"
+    flags: tuple[str, ...] = SMALL_FLAGS
+    recipe: Recipe = SMALL
+
+
+RECORDED = preset("recordings").replace(voxels_per_clip=2, crop_height_px=32, crop_width_px=40)
+
+
+@pytest.fixture(scope="session", params=["videos", "recordings"])
+def corpus(request: pytest.FixtureRequest, clips: Path, tmp_path_factory: pytest.TempPathFactory) -> Corpus:
+    """Videos of each kind whose samples are made of what a file holds."""
+    if request.param == "videos":
+        return Corpus(clips, "deep/c.mp4")
+    folder = write_recordings(tmp_path_factory.mktemp("recordings") / "prepared")
+    flags = ("--videos-kind", "recordings", "--preset", "recordings", *SMALL_FLAGS, "--set", "voxels_per_clip=2")
+    return Corpus(folder, "a.v2ve", "recordings", flags, RECORDED)
 
 
 @pytest.fixture(scope="session")
@@ -126,12 +150,13 @@ def epoch_of(
     batch_size: int = 3,
     shared_memory: bool = True,
     compress: bool = False,
+    recipe: Recipe = SMALL,
 ) -> list[Batch]:
-    """All batches of one epoch under SMALL."""
+    """All batches of one epoch."""
     dataset = V2VStreamDataset(
         address,
         batch_size=batch_size,
-        recipe=SMALL,
+        recipe=recipe,
         seed=seed,
         epoch=epoch,
         shared_memory=shared_memory,
@@ -140,9 +165,9 @@ def epoch_of(
     return list(dataset)
 
 
-def made_here(videos: Path, *epochs: int) -> list[Batch]:
-    """All batches of these epochs under SMALL, made in this process."""
-    dataset = V2VDataset(videos, recipe=SMALL, seed=3)
+def made_here(videos: Path, *epochs: int, recipe: Recipe = SMALL, kind: str = "videos") -> list[Batch]:
+    """All batches of these epochs, made in this process."""
+    dataset = V2VDataset(videos, recipe=recipe, seed=3, videos_kind=kind)
     batches = []
     for epoch in epochs:
         dataset.set_epoch(epoch)

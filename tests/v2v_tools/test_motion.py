@@ -176,7 +176,7 @@ def test_the_start_makes_the_events_of_a_still_clip_and_none_if_it_is_zero(tmp_p
 QUIET = MeasuredMotion(
     changed=1000, lost=30, uncovered=120, paired=100, turned=7, speeds=(0,) * 4 + (600,) + (0,) * 252
 )
-TOLD = "tells the error without and with sub-steps, at twice this motion"
+TOLD = "tells the error without and with sub-steps"
 FAST = QUIET._replace(speeds=(0,) * 12 + (500,) + (0,) * 7 + (100,) + (0,) * 236)
 SMALL = FAST._replace(lost=210)
 

@@ -13,9 +13,10 @@ from pathlib import Path
 from v2v_protocol.errors import UsageError, V2VError
 from v2v_protocol.programs import show
 from v2v_recordings import layout
+from v2v_recordings.item_writer import Written
 from v2v_recordings.items import ConvertOptions, ReadProgress
 from v2v_recordings.late_signals import late_signals
-from v2v_recordings.layout_writer import RecordingWriter, Written
+from v2v_recordings.layout_writer import RecordingWriter
 from v2v_recordings.reading import FORMS, read_items, recognise
 
 EVENT_SUFFIXES = (*layout.SUFFIXES, ".npz", ".raw", ".aedat4", ".es", ".dat", ".bag")

@@ -1,15 +1,7 @@
 """Convert the events of a window to a voxel grid: discrete, as V2V evaluates, or interpolated, as earlier networks do.
 
-With u the position of an event in its window, 0 at the first and just below 1 at the last, polarity p = +1 or -1, and B
-bins:
-
-    discrete       V[floor(B u), y, x]  += p
-    interpolated   V[b, y, x]           += p max(0, 1 - |(B - 1) u - b|)        (Zhu et al. 2019)
-
-Published code takes u = tau / (D + delta), where tau is in integer microseconds after the first event of the window and
-D is tau of the last; delta is 0.001 us (discrete) or 0.0001 us (interpolated). So bins span the events, not the time
-between the pictures. ``span="window"`` takes u = (t - start) / (end - start) instead: these are the bins of training,
-which divide the time between two frames.
+:mod:`v2v_recordings.binning` has the law. Bins span the events, as in published code, not the time between the
+pictures; ``span="window"`` divides the time of the window instead, as training divides the time between two frames.
 """
 
 from __future__ import annotations
@@ -21,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
+from v2v_recordings import binning
 
 Kind = Literal["discrete", "interpolated"]
 Span = Literal["events", "window"]
-DELTA_US = {"discrete": 1e-3, "interpolated": 1e-4}
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,41 +94,20 @@ def voxel_grid(
             f"{np.count_nonzero(outside)} of {len(events)} events lie outside the sensor of {width} x {height}, the "
             f"first at x = {events.x[first]}, y = {events.y[first]}"
         )
-    place = _place(events.t, settings, window)
-    pixel = y * width + x
-    if settings.kind == "discrete":
-        grid = _sum(np.floor(settings.bins * place).astype(np.int64), pixel, events.p, settings.bins, size)
-    else:
-        position = (settings.bins - 1) * place
-        lower = np.floor(position).astype(np.int64)
-        upper_share = position - lower
-        grid = _sum(lower, pixel, events.p * (1 - upper_share), settings.bins, size)
-        # One extra bin for the end of the window, where the share above the last bin is 0.
-        grid += _sum(lower + 1, pixel, events.p * upper_share, settings.bins + 1, size)[:-1]
-    return grid.astype(np.float32)
+    tau, length = _times(events.t, settings, window)
+    place = binning.positions(settings.kind, tau, length, spans_events=settings.span == "events")
+    grid = binning.bin_events(settings.kind, place, y * width + x, events.p, settings.bins, height * width)
+    return grid.astype(np.float32).reshape(-1, height, width)
 
 
-def _place(t: npt.NDArray[np.float64], settings: VoxelSettings, window: tuple[float, float]) -> npt.NDArray[np.float64]:
-    """Return u of each event, 0 <= u < 1."""
+def _times(
+    t: npt.NDArray[np.float64], settings: VoxelSettings, window: tuple[float, float]
+) -> tuple[npt.NDArray[np.float64], float]:
+    """Return the time of each event since the beginning of its grid, and the grid's length, whole microseconds."""
     if settings.span == "window":
         # In integer microseconds as well: otherwise rounding decides on which side of an edge an event falls.
         start, end = window
-        tau, length = np.rint((t - start) * 1e6), max(1.0, np.rint((end - start) * 1e6))
-        place: npt.NDArray[np.float64] = np.clip(tau / length, 0.0, np.nextafter(1.0, 0.0))
-    else:
-        microseconds = (t - t[0]) * 1e6
-        tau = np.trunc(microseconds) if settings.truncate else np.rint(microseconds)
-        place = tau / (tau[-1] + DELTA_US[settings.kind])
-    return place
-
-
-def _sum(
-    bins_of: npt.NDArray[np.int64],
-    pixel: npt.NDArray[np.int64],
-    weights: npt.NDArray[np.floating],
-    bins: int,
-    size: tuple[int, int],
-) -> npt.NDArray[np.float64]:
-    pixels = size[0] * size[1]
-    sums = np.bincount(bins_of * pixels + pixel, weights, minlength=bins * pixels).astype(np.float64, copy=False)
-    return sums.reshape(bins, *size)
+        return np.rint((t - start) * 1e6), float(np.rint((end - start) * 1e6))
+    microseconds = (t - t[0]) * 1e6
+    tau = np.trunc(microseconds) if settings.truncate else np.rint(microseconds)
+    return tau, float(tau[-1])

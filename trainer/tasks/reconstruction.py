@@ -38,6 +38,7 @@ class ReconstructionSettings:
             :class:`trainer.losses.temporal.TemporalConsistency`.
         flow: "raft" on this device, or "stream": estimated by the server's workers.
         raft_size, raft_weights: "small" or "large", and its weight file.
+        voxels: the array that the network takes: "voxels", or "voxels_bilinear" (interpolated).
         guide_epochs: epochs in which a network that sees its own last picture (HyperE2VID) gets a mixture of that and
             the true one; the share of the true one falls linearly from 1 to 0. 0: it never gets the true one.
         guide_as_published: the true picture at step t is that of t, which is the target itself; else that of t-1.
@@ -55,6 +56,7 @@ class ReconstructionSettings:
     flow: Literal["raft", "stream"] = "raft"
     raft_size: str = chosen("small", WHERE_TO_GET_WEIGHTS)
     raft_weights: str = ""
+    voxels: Literal["voxels", "voxels_bilinear"] = "voxels"
     guide_epochs: int = limited(0, 0, 1_000_000)
     guide_as_published: bool = False
 
@@ -101,11 +103,11 @@ class Reconstruction(Task):
     def asked(self) -> Asked:
         """Arrays to request: frames, and flow if the stream estimates it."""
         if not self.settings.temporal_weight or self._raft is not None:
-            return Asked(arrays=("voxels", "frames"))
+            return Asked(arrays=(self.settings.voxels, "frames"))
         # The loss needs to know where each pixel was; the released code takes negated forward flow for that.
         direction = "forward" if self.settings.temporal_as_published else "backward"
         return Asked(
-            arrays=("voxels", "frames", "flow"),
+            arrays=(self.settings.voxels, "frames", "flow"),
             flow_direction=direction,
             flow_from=self.settings.temporal_first_step,
         )
@@ -116,7 +118,8 @@ class Reconstruction(Task):
         truth = {"frames": frames}
         if self._loss.temporal is not None:
             truth["flow"] = self._flow(batch, frames)
-        return Work(voxels=batch.arrays["voxels"].to(self.device), truth=truth, guide=self._guide(frames, epoch))
+        voxels = batch.arrays[self.settings.voxels].to(self.device)
+        return Work(voxels=voxels, truth=truth, guide=self._guide(frames, epoch))
 
     def recording_scorer(self, network: VoxelNetwork, voxels: VoxelSettings) -> PictureScorer:
         """See :meth:`Task.recording_scorer`.

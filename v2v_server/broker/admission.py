@@ -16,7 +16,7 @@ from v2v_server.broker.leases import clean_name
 from v2v_server.broker.session import Session
 from v2v_server.broker.state import Broker
 from v2v_server.lease_memory import MOST_CLIP_BYTES
-from v2v_server.schedule import Schedule, SequenceTable
+from v2v_server.schedule import Schedule, SequenceTable, suitable_kind
 
 MOST_BATCH_SIZE = 65_536
 MOST_CREDIT = 400
@@ -154,7 +154,6 @@ def _table(broker: Broker, spec: StreamSpec) -> SequenceTable:
         recipe.crop_width_px,
         recipe.resize_scale,
         recipe.light,
-        recipe.is_world,
         recipe.exposure_seconds,
         spec.flow_margin_px,
         spec.levels_per_step,
@@ -165,6 +164,7 @@ def _table(broker: Broker, spec: StreamSpec) -> SequenceTable:
         spec.still_share,
         spec.quiet_share,
     )
+    suitable_kind(broker.facts.videos, spec)  # a table is also one of specs that such videos do not suit
     table = broker.tables.get(geometry)
     if table is None:
         table = SequenceTable(broker.facts.videos, broker.facts.rows, spec, broker.columns)

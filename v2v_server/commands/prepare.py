@@ -12,7 +12,9 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from v2v_protocol.command import FAILED, Parser, run_command
 from v2v_protocol.errors import UsageError, V2VError
@@ -85,6 +87,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(arguments: argparse.Namespace) -> int:
     if arguments.workers < 1:
         raise UsageError(f"--workers {arguments.workers}: give at least 1")
+    if converter := kind_from(vars(arguments)).converter:
+        return _convert(import_module(converter), arguments)
     started = time.monotonic()
     source = Path(arguments.source).absolute()
     single = source.is_file() and source.suffix.lower() not in LIST_SUFFIXES
@@ -126,6 +130,25 @@ def _run(arguments: argparse.Namespace) -> int:
         ]
         write_json(arguments.json, records)
     return 0 if report.complete else FAILED
+
+
+def _convert(converter: Any, arguments: argparse.Namespace) -> int:
+    """Prepare what is no video yet, with the module of its kind."""
+    for name, default in (("list", None), ("rows", None), ("scene", "off"), ("planes", []), ("size", DEFAULT_SIZE)):
+        if getattr(arguments, name) != default:
+            raise UsageError(f"--{name} has no effect with --videos-kind {arguments.videos_kind}: leave it out")
+    source, destination = Path(arguments.source), Path(arguments.destination)
+    converted = list[Any]()
+    with Progress("preparing", "recordings") as shown:
+        for each in converter.convert_recordings(source, destination, arguments.workers):
+            converted.append(each)
+            shown(len(converted), None)
+    converted.sort(key=lambda each: str(each.id))
+    for line in converter.summary(converted, destination):
+        show(line)
+    if arguments.json is not None:
+        write_json(arguments.json, [asdict(each) for each in converted])
+    return FAILED if any(each.problem for each in converted) else 0
 
 
 def _is_video(source: Path, root: Path) -> bool:

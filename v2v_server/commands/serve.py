@@ -25,7 +25,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         [
             "v2v-serve --videos clips/ --workers 8",
             "v2v-serve --videos webvid10k/ --rows top:0.54 --preset fast --scene auto",
-            "v2v-serve --videos clips/ --recipe davis346 --set voxels_per_clip=20 --set 'threshold=[0.2,0.4]'",
+            "v2v-serve --videos clips/ --recipe davis346-measured --set voxels_per_clip=20 --set 'threshold=[0.2,0.4]'",
             "v2v-serve --config serve.yaml",
         ],
         "Exit status: 0 ended by SIGTERM, 130 by Ctrl-C; a second signal ends it at once, without a summary.",

@@ -5,4 +5,5 @@ registry      all kinds: which one owns an id, which one a user asks for, and th
 videos        a file that is decoded
 sequences     numbered pictures in a folder or an archive
 photographs   a picture that the camera moves over
+recordings    a recording of an event camera
 """

@@ -26,7 +26,11 @@ if TYPE_CHECKING:  # a command line starts without the decoder
     from v2v_server.simulation.precision import Variant
     from v2v_server.video.probe import VideoFacts
 
-RATE = 0.0, 0.0, 1e6, "rate of picture sequences without time stamps, 0: unknown; of photographs, 0: 60"
+RATE = (
+    0.0, 0.0, 1e6,
+    "rate of picture sequences without time stamps, 0: unknown; of photographs, 0: 60; of the marks of recordings, 0: "
+    "as --marks states",
+)  # fmt: skip
 """What kinds of pictures without times of their own state of their flag ``rate``, in Hz."""
 LEAST_EXPOSED = 4
 """Frames of a video that an exposure lasts at least."""
@@ -56,8 +60,11 @@ class VideosKind:
         seeks_by_time: whether a frame is found by its time stamp; if it has none, all frames before it are decoded.
         is_view: whether its clips are what the camera of each sample sees, with the levels between frames and all
             that is known exactly (:class:`v2v_server.video.decode.DecodedClip`).
+        is_simulated: whether its events are simulated, from its frames.
         shown_arrays: arrays of every video that a preview draws; empty: those of its sidecars.
         unprepared: why ``v2v-prepare`` does not take it; "" if it does.
+        converter: module that makes its videos of other files for ``v2v-prepare``
+            (:mod:`v2v_server.prepare_recordings`); "" if none does.
 
     Raises:
         UsageError: a flag is outside its limits.
@@ -76,8 +83,10 @@ class VideosKind:
     has_motion: ClassVar[bool] = True
     seeks_by_time: ClassVar[bool] = False
     is_view: ClassVar[bool] = False
+    is_simulated: ClassVar[bool] = True
     shown_arrays: ClassVar[Sequence[str]] = ()
     unprepared: ClassVar[str] = ""
+    converter: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
         check_settings(self, flag_of)
@@ -138,9 +147,13 @@ class VideosKind:
 
     def refuses(self, spec: StreamSpec) -> str:
         """Return why no sample of a spec can be made of such videos, and what to do; "" if it can."""
-        if not spec.recipe.is_world:
-            return ""
-        return f"the recipe's world fields are for photographs, these are {self.name}: add --videos-kind photographs"
+        for is_set, fields, kind in (
+            (spec.recipe.is_world, "world fields", "photographs"),
+            (spec.recipe.is_recorded, "fields bin_span and added_...", "recordings"),
+        ):
+            if is_set and kind != self.name:
+                return f"the recipe's {fields} are for {kind}, these are {self.name}: add --videos-kind {kind}"
+        return ""
 
     def least_hz(self, spec: StreamSpec) -> float:
         """Return the least rate of such videos whose samples can be made under a spec, frames a second; 0 for any."""

@@ -73,7 +73,7 @@ class PhotographKind(VideosKind):
     def refuses(self, spec: StreamSpec) -> str:
         """Return that nothing moves without a world."""
         if spec.recipe.is_world:
-            return ""
+            return super().refuses(spec)
         return "photographs stand still under this recipe: set world fields, as --preset worlds does"
 
     def least_hz(self, spec: StreamSpec) -> float:

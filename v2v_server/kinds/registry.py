@@ -16,6 +16,7 @@ KIND_FILES = (
     "videos",
     "sequences",
     "photographs",
+    "recordings",
 )
 """Files of the kinds. The first is the default, and owns ids of all other endings, which a list may name."""
 KINDS: dict[str, VideosKind] = {

@@ -30,7 +30,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import Range, Recipe, effect_settings
+from v2v_protocol.recipe import ADDED, Range, Recipe, effect_settings
 from v2v_protocol.sample import SampleParams
 from v2v_server.simulation.voxel import step_seconds
 
@@ -162,6 +162,10 @@ def draw(
         },
         log_eps=_log_eps(recipe.log_eps, stream(Purpose.LOG_EPS, 1)[0]),
         exposure_seconds=in_range(recipe.exposure_seconds, stream(Purpose.EXPOSURE, 1)[0]),
+        added={
+            name: in_range(getattr(recipe, name), stream(_stream_of(name), 1)[0])
+            for name in (ADDED if recipe.is_noisy else ())
+        },
     )
     return _timed(params, recipe, stream, times) if recipe.is_timed else params
 

@@ -378,6 +378,8 @@ class DecodedClip:
         arrays: arrays of the sample that come with the pixels, by name, as they are delivered.
         is_view: whether the frames are what the camera of the sample sees, so that its view is not applied.
         levels: :class:`v2v_server.simulation.voxel.Levels` between these frames; None without.
+        saturated: how many values of these arrays were clipped, by name; only those that have any.
+        unlabelled: why requested arrays cannot be made of this video, by name.
     """
 
     frames: npt.NDArray[Any]
@@ -391,6 +393,8 @@ class DecodedClip:
     arrays: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
     is_view: bool = False
     levels: Any = None  # of a package above this one
+    saturated: Mapping[str, int] = field(default_factory=dict)
+    unlabelled: Mapping[str, str] = field(default_factory=dict)
 
 
 Way = Callable[[Stack], Generator[VideoFrame, None, None]]

@@ -241,7 +241,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = Parser(
         "v2v-doctor", "[--videos DIR] [flags]",
         "Check this machine, this installation and a corpus, and say what to change.",
-        ["v2v-doctor --videos webvid10k/", "v2v-doctor --videos webvid10k/ --recipe davis346 --port 6000"],
+        ["v2v-doctor --videos webvid10k/", "v2v-doctor --videos webvid10k/ --recipe davis346-measured --port 6000"],
         "Exit status: 0 no problems found, 1 problems found.",
     )  # fmt: skip
     what = parser.group("What to check")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import math
 import sys
 import tempfile
@@ -31,13 +30,11 @@ from v2v_tools.tradeoff.measures import (
     diversity,
     leases_of,
     making,
-    motion_error,
 )
-from v2v_tools.tradeoff.report import MOTION_KEY, best, error_fields, error_of, name_dominated, tables
-from v2v_tools.tradeoff.settings import BESIDE, SOURCE, STORES, ServeSetting, axes, halves, open_forms, settings
+from v2v_tools.tradeoff.rendered import true_rates
+from v2v_tools.tradeoff.report import best, error_fields, error_of, name_dominated, reasons, tables
+from v2v_tools.tradeoff.settings import BESIDE, SOURCE, STORES, ServeSetting, axes, open_forms, settings
 
-_MOST_REPEATS = 0.03
-"""From this share of the steps on, repeated frames are named."""
 _DEFAULT_FORMS = ("lossless dense", "lossless fast")
 
 
@@ -45,10 +42,10 @@ def _parser() -> Parser:
     parser = Parser(
         "v2v-tradeoff", "--videos DIR [flags]",
         "Measure on your clips what each way to serve them costs: processor time, disk space, the error of its form "
-        "against exactly decoded frames, the error where every second frame is left out, and diversity, for the "
-        "source, stores and another encoding, with all combinations of the values of some fields. A setting is "
-        "dominated when another one is at least as good in everything and better in one thing. Name the best setting "
-        "for a wish, and write it for v2v-serve --config.",
+        "against exactly decoded frames, the error of its frames and sub-steps against what the clips show at the true "
+        "rate, rendered, and diversity, for the source, stores and another encoding, with all combinations of the "
+        "values of some fields. A setting is dominated when another one is at least as good in everything and better "
+        "in one thing. Name the best setting for a wish, and write it for v2v-serve --config.",
         [
             "v2v-tradeoff --videos clips/ --json tradeoff.json",
             "v2v-tradeoff --videos clips/ --target-rate 20 --vary samples_per_decode=1,2 --preset-out chosen.yaml",
@@ -132,12 +129,17 @@ def _measured(corpus: Mapping[str, Catalogue], compared: Sequence[ServeSetting])
     show(f"timing {len(compared)} settings", sys.stderr)
     works = {each.name: making(leases[each.single], each.spec.samples_per_decode) for each in compared}
     seconds = cpu_seconds(works, max(len(each.each) for each in leases.values()))
-    records, scale = list[dict[str, Any]](), list[dict[str, Any]]()
+    records, others, rates = list[dict[str, Any]](), list[dict[str, Any]](), dict[ServeSetting, dict[str, Any]]()
+    for recipe in dict.fromkeys(each.spec.recipe for each in compared):
+        mine = list(dict.fromkeys(each.exact for each in compared if each.spec.recipe == recipe))
+        show(f"rendering what the clips show: {', '.join(each.way for each in mine)}", sys.stderr)
+        found, by_speed = true_rates(leases[mine[0]], {each.spec.substep_px: each.way for each in mine})
+        rates |= {each: found[each.spec.substep_px] for each in mine}
+        others += by_speed
     for exact in dict.fromkeys(each.exact for each in compared):
         mine = [setting for setting in compared if setting.exact == exact]
         show(f"comparing {len(mine)} settings with {exact.way}", sys.stderr)
         sums = accuracy(leases[exact], {setting.way: leases[setting.single] for setting in mine})
-        of_motion = _motion_fields(exact, corpus[SOURCE])
         for setting in mine:
             spec, clips, source = setting.spec, corpus[setting.form], corpus[SOURCE]
             taken = seconds[setting.name]
@@ -147,26 +149,15 @@ def _measured(corpus: Mapping[str, Catalogue], compared: Sequence[ServeSetting])
                 "bytes_ratio": _nbytes(clips) / _nbytes(source),
                 "bytes_per_video_second": _nbytes(clips) / _seconds(source),
                 "samples_per_core_second": 1.0 / taken, "cpu_seconds_per_sample": taken,
-                "speed_ratio": seconds[compared[0].name] / taken, **error_fields(sums[setting.way]), **of_motion,
+                "speed_ratio": seconds[compared[0].name] / taken, **error_fields(sums[setting.way]), **rates[exact],
             })  # fmt: skip
-        scale = scale or [{"measure": "scale", "way": row, **error_fields(sums[row])} for row in (NOISE_ROW, DRAW_ROW)]
+        if exact == compared[0].exact:
+            others += ({"measure": "scale", "way": row, **error_fields(sums[row])} for row in (NOISE_ROW, DRAW_ROW))
     for recipe in dict.fromkeys(each.spec.recipe for each in compared):
         names = {each.name for each in compared if each.spec.recipe == recipe}
         name_dominated([record for record in records if record["name"] in names])
     show("measuring diversity", sys.stderr)
-    return records + scale + diversity(leases[compared[0].single])
-
-
-def _motion_fields(setting: ServeSetting, source: Catalogue) -> dict[str, float | None]:
-    """Return the errors at twice the motion; say where repeated frames make them larger than motion does."""
-    whole, half = (dataclasses.replace(setting, spec=spec) for spec in halves(setting.spec))
-    found = motion_error(leases_of(whole, source), leases_of(half, source))
-    if found.repeats >= _MOST_REPEATS:
-        show(
-            f"{setting.way}: {found.repeats:.0%} of the frames repeat the one before: the error at twice the motion is "
-            "also theirs (v2v-serve --scene auto drops them)", sys.stderr,
-        )  # fmt: skip
-    return {MOTION_KEY: found.voxels, "count_error_at_twice_the_motion": found.events}
+    return records + others + diversity(leases[compared[0].single])
 
 
 def _nbytes(clips: Catalogue) -> int:
@@ -185,11 +176,11 @@ def choose(records: Sequence[Mapping[str, Any]], compared: Sequence[ServeSetting
     except UsageError as error:
         show(f"v2v-tradeoff: {error}", sys.stderr)
         return FAILED
-    why = f"{record['samples_per_core_second']:.3g} samples a core second, error {error_of(record):.3g}"
-    print(f"best: {record['name']}: {why}")
+    rate, worst = record["samples_per_core_second"], error_of(record)
+    print(f"best: {record['name']}: {rate:.3g} samples a core second, error {worst:.3g}")
     if asked.preset_out is not None:
         (chosen,) = (setting for setting in compared if setting.name == record["name"])
-        write_file(asked.preset_out, chosen.yaml(asked.rows, why), "--preset-out")
+        write_file(asked.preset_out, chosen.yaml(asked.rows, reasons(record)), "--preset-out")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""What is measured of each setting: what its form and its frames cost, and processor time; and how alike samples are.
+"""What is measured of each setting on its clips: what its form costs, and processor time; and how alike samples are.
 
 Everything is measured on the same sequences of the corpus in each form. A lease of each has four views: samples of one
 decode, next to each other.
@@ -11,10 +11,7 @@ has events:
     voxel error    sum |V - R| / sum |R|
     count error    (sum |V| - sum |R|) / sum |R|
 
-**The error at twice the motion.** The clip judges the settings by what it knows: with every second frame left out, the
-setting's events V are compared with those of all frames R, without noise, in bins of two frames. Occlusions, insects
-and blur are the clip's own, and no model of motion decides. R has no events that fall between two frames, so at the
-clip's own motion a setting is off by less than this where things move evenly.
+**Errors at the true rate** are measured on what is rendered from the clips (``rendered``).
 
 **Resemblance.** The course of a sample is its number of events in each bin. Courses of different clips correlate as
 well, because every camera begins running and pauses later. The correlation of samples of one decode beyond that is
@@ -47,15 +44,13 @@ from v2v_server.worker.making.make import make_sample, sample_context
 from v2v_server.worker.making.plan import plan_sample
 from v2v_server.worker.making.read import decode_for
 from v2v_tools.remake import lease_for
-from v2v_tools.tradeoff.report import ERROR_THRESHOLD, THRESHOLDS
+from v2v_tools.tradeoff.report import THRESHOLDS
 from v2v_tools.tradeoff.settings import ServeSetting
 
 NOISE_ROW, DRAW_ROW = "another noise seed", "another threshold draw"
 _VIEWS = 4
 _LEASES_OF_A_CLIP = 2
 _ROUNDS = 3
-_REPEAT = 12
-"""Where a frame repeats the one before, a step has at most this part of the events of each neighbour."""
 
 
 class Leases(NamedTuple):
@@ -140,45 +135,6 @@ def accuracy(model: Leases, others: Mapping[str, Leases]) -> dict[str, npt.NDArr
             for name, pair in (made | {NOISE_ROW: (exact, noisy), DRAW_ROW: (exact, redrawn)}).items():
                 sums[name][row] += compare(simulated(*pair).voxels, truth)
     return sums
-
-
-class MotionError(NamedTuple):
-    """How a setting compares with all frames where every second one is left out, over all leases.
-
-    Attributes:
-        voxels: sum |V - R| / sum |R| over signed bins of two frames; None without events.
-        events: (events of V - events of R) / events of R, both polarities counted; None without events.
-        repeats: share of the steps between two frames that have hardly an event, between two that have many: frames
-            that repeat.
-    """
-
-    voxels: float | None
-    events: float | None
-    repeats: float
-
-
-def motion_error(all_frames: Leases, every_second: Leases) -> MotionError:
-    """Compare the events of every second frame with those of all, at ERROR_THRESHOLD.
-
-    Args:
-        all_frames, every_second: the streams of :func:`v2v_tools.tradeoff.settings.halves`.
-    """
-    difference = binned = told = true = 0.0
-    repeats = steps = 0
-    for number in range(len(all_frames.each)):
-        (whole,), (half,) = seen(all_frames, number), seen(every_second, number)
-        camera = dataclasses.replace(whole.params, threshold_pos=ERROR_THRESHOLD, threshold_neg=ERROR_THRESHOLD)
-        fine, coarse = simulated(whole, camera), simulated(half, camera)
-        truth = fine.voxels.reshape(-1, 2, *fine.voxels.shape[2:])
-        sums = compare(coarse.voxels.reshape(-1, *truth.shape[2:]), truth.sum(axis=1))
-        difference, binned = difference + sums[0], binned + sums[2]
-        told, true = told + coarse.array("event_counts").sum(), true + fine.array("event_counts").sum()
-        events = np.abs(truth).sum(axis=(2, 3)).ravel()
-        neighbours = np.minimum(events[:-2], events[2:])
-        repeats += int(np.count_nonzero((events[1:-1] * _REPEAT <= neighbours) & (neighbours > 0)))
-        steps += len(events)
-    of = float(difference / binned) if binned else None
-    return MotionError(of, float(told / true - 1.0) if true else None, repeats / steps)
 
 
 def diversity(leases: Leases) -> list[dict[str, Any]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from io import StringIO
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,14 +13,36 @@ from rich.console import Console
 from rich.table import Table
 
 from v2v_protocol.errors import UsageError
+from v2v_tools.motion import MOST_LOST
 
 THRESHOLDS = (0.05, 0.2, 0.5, 1.0, 2.0)
 """Contrast thresholds at which errors are measured."""
 ERROR_THRESHOLD = 0.2
-ERROR_KEY = f"voxel_error_at_{ERROR_THRESHOLD:g}"
-"""The error of a form."""
-MOTION_KEY = "voxel_error_at_twice_the_motion"
-"""The error of a clip's frames; with ERROR_KEY what settings are judged by."""
+
+
+class Measure(NamedTuple):
+    """An error, as a share: its key in records, its title in tables, and what it is compared with."""
+
+    key: str
+    title: str
+    reference: str
+
+
+FORM = Measure(
+    f"voxel_error_at_{ERROR_THRESHOLD:g}",
+    "form",
+    "voxels against those of the same setting from exactly decoded frames",
+)
+TRUE_RATE = (
+    Measure(
+        "voxel_error_at_the_true_rate", "true rate",
+        "signed bins of a frame against the true ones, of frames of the clips that move as the clips do, rendered",
+    ),
+    Measure("split_error_at_the_true_rate", "split", "bins of both polarities against these"),
+    Measure("count_error_at_the_true_rate", "count", "number of events against these"),
+)  # fmt: skip
+JUDGES = FORM, TRUE_RATE[0]
+"""The errors that settings are judged by."""
 
 Record = Mapping[str, Any]
 Costs = tuple[float, ...]
@@ -44,10 +66,14 @@ _SETTINGS: _Columns = (
     ("cpu_seconds_per_sample", "CPU s/batch", "{:.2f}", BATCH),
     ("bytes_ratio", "x disk", "{:.2f}", 1),
     ("bytes_per_video_second", "MB/s", "{:.2f}", 1e-6),
-    (ERROR_KEY, "form", "{:.2f}", 100),
-    (MOTION_KEY, "2 x motion", "{:.2f}", 100),
-    ("count_error_at_twice_the_motion", "count", "{:+.2f}", 100),
+    *((each.key, each.title, "{:+.2f}" if each.title == "count" else "{:.2f}", 100) for each in (FORM, *TRUE_RATE)),
     ("dominated_by", "dominated by", "{}", 1),
+)
+_SPEEDS: _Columns = (
+    ("way", "per cent, at the true rate", "{}", 1),
+    ("px_per_frame", "px a frame", "{}", 1),
+    ("events_share", "of all events", "{:.0f}", 100),
+    *_SETTINGS[-4:-1],
 )
 _DIVERSITY: _Columns = (
     ("name", "correlation between", "{}", 1),
@@ -72,7 +98,7 @@ def dominators(costs: Mapping[str, Costs]) -> dict[str, str | None]:
 
 def name_dominated(records: Sequence[dict[str, Any]]) -> None:
     """Add to each setting's record a setting that dominates it in speed, errors, diversity and disk space, or None."""
-    keys = ("cpu_seconds_per_sample", ERROR_KEY, MOTION_KEY, "samples_per_decode", "bytes_per_video_second")
+    keys = ("cpu_seconds_per_sample", *(each.key for each in JUDGES), "samples_per_decode", "bytes_per_video_second")
     # Without events there is no relative error, and no form is worse than another.
     found = dominators(
         {r["name"]: tuple(math.inf if r[key] is None else float(r[key]) for key in keys) for r in records}
@@ -82,15 +108,33 @@ def name_dominated(records: Sequence[dict[str, Any]]) -> None:
 
 
 def error_of(record: Record) -> float:
-    """Return the larger of a setting's two errors; 0 where there are no events."""
-    return max(record[ERROR_KEY] or 0.0, record[MOTION_KEY] or 0.0)
+    """Return the larger of the two errors that a setting is judged by; 0 where there are no events."""
+    return max(record[each.key] or 0.0 for each in JUDGES)
+
+
+def untold(records: Sequence[Record]) -> str:
+    """Return why the error at the true rate of some settings cannot be told; "" where it can be."""
+    lost = max((record["lost_share"] for record in records), default=0.0)
+    if lost <= MOST_LOST:
+        return ""
+    return (
+        f"the error at the true rate cannot be told: no block follows {lost:.0%} of the pixels that change, and the "
+        f"limit is {MOST_LOST:.0%}; something small or fast moves, or light flickers: take videos with more frames a "
+        "second"
+    )
+
+
+def reasons(record: Record) -> str:
+    """Return the figures of a setting with what they are compared with, a line each."""
+    errors = [f"{each.title} {record[each.key] or 0.0:.2%}: {each.reference}" for each in (FORM, *TRUE_RATE)]
+    return "\n".join([f"{record['samples_per_core_second']:.3g} samples a core second", *errors])
 
 
 def best(records: Sequence[Record], *, target_rate: float | None, max_error: float | None) -> Record:
     """Return the setting to take.
 
     Args:
-        records: of the settings; each has "samples_per_core_second", "samples_per_decode", ERROR_KEY and MOTION_KEY,
+        records: of the settings; each has "samples_per_core_second", "samples_per_decode" and those of JUDGES,
             which are None where there are no events. The larger of both is its error.
         target_rate: samples a core second. Take the smallest error at this rate or above; of equals the fewest samples
             per decode, then the fastest.
@@ -98,8 +142,10 @@ def best(records: Sequence[Record], *, target_rate: float | None, max_error: flo
             per decode.
 
     Raises:
-        UsageError: no setting fulfils the wish; the message names the nearest.
+        UsageError: no setting fulfils the wish, and the message names the nearest; or an error cannot be told.
     """
+    if why := untold(records):
+        raise UsageError(f"no best setting: {why}")
     if target_rate is not None:
         fit = [record for record in records if record["samples_per_core_second"] >= target_rate]
         if not fit:
@@ -130,7 +176,7 @@ def error_fields(sums: npt.NDArray[np.float64]) -> dict[str, float | None]:
 
 def tables(records: Sequence[Record]) -> str:
     """Return the settings, their errors, and the diversity as text."""
-    of = {kind: [r for r in records if r["measure"] == kind] for kind in ("setting", "scale", "diversity")}
+    of = {kind: [r for r in records if r["measure"] == kind] for kind in ("setting", "scale", "speed", "diversity")}
     numbers = {record["name"]: f"{number}" for number, record in enumerate(of["setting"], 1)}
     listed = [
         {**record, "name": f"{numbers[record['name']]:>2s}  {record['name']}",
@@ -138,12 +184,14 @@ def tables(records: Sequence[Record]) -> str:
         for record in of["setting"]
     ]  # fmt: skip
     ways = list({record["way"]: record for record in reversed(of["setting"])}.values())[::-1]
+    errors = "; ".join(f"{each.title}, {each.reference}" for each in (FORM, *TRUE_RATE))
     about = (
         f"CPU s/batch: of {BATCH} samples; x disk: of the source; MB/s: of video. Errors in per cent at c = "
-        f"{ERROR_THRESHOLD:g}: form, voxels against the same setting from exactly decoded frames; 2 x motion, "
-        "voxels of every second frame against those of all frames; count, its number of events\n"
+        f"{ERROR_THRESHOLD:g}: {errors}\n{untold(of['setting'])}"
     )
     parts = [format_table(listed, _SETTINGS) + about, format_table([*ways, *of["scale"]], _ERRORS)]
+    if of["speed"]:
+        parts.append(format_table(of["speed"], _SPEEDS))
     if of["diversity"]:
         parts.append(format_table(of["diversity"], _DIVERSITY))
     return "\n".join(parts)

@@ -71,8 +71,8 @@ class ServeSetting:
         return dataclasses.replace(self, spec=dataclasses.replace(self.spec, samples_per_decode=1, sibling_spacing=0))
 
     def yaml(self, rows: str, why: str) -> str:
-        """Return the setting as a file for ``v2v-serve --config``; ``why`` is one line about the choice."""
-        lines = [f"# {self.name}: {why}"]
+        """Return the setting as a file for ``v2v-serve --config``; ``why`` are lines about the choice."""
+        lines = [f"# {line}" for line in f"{self.name}: {why}".splitlines()]
         if self.form == BESIDE:
             lines += ["# Serve the folder of --beside."]
         elif self.form != SOURCE:
@@ -125,24 +125,6 @@ def settings(forms: Sequence[str], spec: StreamSpec, varied: Axes) -> list[Serve
                 names.append(f"{key} = {value}")
         streams.append((stream, tuple(names)))
     return [ServeSetting(form, *stream) for form in (SOURCE, *forms) for stream in streams]
-
-
-def halves(spec: StreamSpec) -> tuple[StreamSpec, StreamSpec]:
-    """Return two streams of the same sequences: one of all frames without sub-steps, one with every second frame left
-    out. Nothing in them is random but the crop: no noise, no pauses. Grids are counted in frames, and there are two
-    at least, so that they can be halved.
-
-    Raises:
-        UsageError: ``frame_stride`` cannot be doubled.
-    """
-    recipe = spec.recipe
-    count = max(1, recipe.voxels_per_clip // 2)
-    both = recipe.replace(
-        voxels_per_clip=2 * count, lead_frames=0, lead_voxels=0, voxel_seconds=(0.0, 0.0), noise_sigma=(0.0, 0.0),
-        hot_pixel_share=(0.0, 0.0), shot_noise_hz=(0.0, 0.0), leak_hz=(0.0, 0.0), pause_probability=0.0,
-    )  # fmt: skip
-    half = both.replace(voxels_per_clip=count, frame_stride=2 * recipe.frame_stride)
-    return dataclasses.replace(spec, recipe=both, substep_px=0.0), dataclasses.replace(spec, recipe=half)
 
 
 def _changed(spec: StreamSpec, key: str, value: str) -> StreamSpec:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -55,14 +56,21 @@ def test_each_network_ships_or_is_out_for_a_reason(networks: dict[str, Figures])
         assert all(networks[ships]["correlation"] >= networks[name]["correlation"] - rule.SLACK for name in better)
 
 
-def test_the_squared_error_of_a_grey_is_the_variance_of_each_judged_picture() -> None:
+def test_one_grey_stands_for_all_judged_pictures() -> None:
     frames = torch.rand(2, 4, 1, 8, 8)
     frames[:, 2:, :, :, :4], frames[:, 2:, :, :, 4:] = 0.25, 0.75
-    frames[1] += 0.1  # a constant for all pictures would not do
+    frames[1] += 0.1  # the mean of each picture would not do: events do not say how bright it is
     found = rule.on_worlds(
         (torch.zeros(2, 4, 5, 8, 8), frames), NETWORKS["firenet"](base_channels=2), make_metrics(["mse"], {})
     )
-    assert found["grey_mse"] == pytest.approx(0.0625, rel=1e-5)
+    assert found["grey_mse"] == pytest.approx(0.0625 + 0.05**2, rel=1e-5)
+
+
+@given(st.lists(st.lists(UNITS, min_size=4, max_size=4), min_size=1, max_size=5))
+def test_its_squared_error_comes_of_means(pictures: list[list[float]]) -> None:
+    means = {name: float(np.mean(values)) for name, values in {"grey": pictures, "square": np.square(pictures)}.items()}
+    found = rule.with_grey_mse(means | {"mse": 0.5})
+    assert found == {"mse": 0.5, "grey_mse": pytest.approx(np.var(pictures), abs=1e-12)}
 
 
 def test_the_mean_weighs_both_kinds_of_data_alike() -> None:

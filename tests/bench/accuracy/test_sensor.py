@@ -139,6 +139,36 @@ def test_a_recording_is_like_itself_and_not_like_its_mirror() -> None:
     assert (empty["correlation"], empty["missed"], empty["invented"]) == (0.0, 1.0, 0.0)
 
 
+def test_the_rate_of_still_pixels_is_that_of_pixels_around_which_no_frame_changes() -> None:
+    """Events are added to every pixel; a rate is counted where the picture stands still, and near no pixel that
+    moves.
+    """
+    made = given()
+    frames = made.frames.copy()
+    frames[:, made.pixels % WIDTH < 24] = 100
+    frames[:, made.pixels % WIDTH < 12] += np.arange(6, dtype=np.uint8)[:, None] % 2  # noise of frames
+    half = dataclasses.replace(made, frames=frames)
+    still = simulators.is_unchanged(half)
+    np.testing.assert_array_equal(still, np.broadcast_to(made.pixels % WIDTH < 20, still.shape))
+    every = np.arange(len(made.pixels))
+    noisy = simulators.of_events(half, np.repeat(made.frame_us[:-1] + 7, len(every)), np.tile(every, 5), still.ravel())
+    empty = simulators.of_events(half, [], [], [])
+    found = figures_of(empty, noisy)
+    assert (found["still_hz"], found["sensor_still_hz"]) == (pytest.approx(1 / 0.02), 0.0)
+    assert figures_of(noisy, empty)["sensor_still_hz"] == pytest.approx(1 / 0.02)
+
+
+@pytest.mark.parametrize("hz", [100.0, 120.0, 77.0])
+def test_a_lamp_is_told_by_the_phase_of_brighter_events(hz: float) -> None:
+    made = given()
+    still = dataclasses.replace(made, frames=np.full_like(made.frames, 90))
+    t = np.arange(0.0, 0.1, 1 / hz)
+    us = made.frame_us[0] + np.repeat(1e6 * np.concatenate([t, t + 0.5 / hz]), 9)  # darker half a period later
+    lamp = simulators.of_events(still, us, np.arange(len(us)), np.arange(len(us)) < len(us) // 2)
+    assert (sensor.lamp_strength(lamp) > 0.99) == (hz in sensor.LAMPS_HZ)
+    assert sensor.lamp_strength(simulators.of_events(still, [], [], [])) == 0.0
+
+
 @settings(max_examples=10)
 @hypothesis.given(st.integers(0, 99))
 def test_figures_from_sums_are_those_of_the_maps(seed: int) -> None:
@@ -202,9 +232,35 @@ def test_thresholds_are_found_on_one_half_and_bars_are_said(tmp_path: Path, monk
         ranks = {int(row["correlation_rank"].split()[0]): row["correlation"] for row in mine}
         assert sorted(ranks) == list(range(1, len(mine) + 1))
         assert [ranks[rank] for rank in sorted(ranks)] == sorted(ranks.values(), reverse=True)
-    worse = [dict(row, correlation=0.0) if row["simulator"] == sensor.NEW else row for row in whole]
-    assert f"correlation: {sensor.NEW} 0.000" in "; ".join(sensor.missed(worse))
-    assert sensor.missed([]) == []
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({}, ""),
+        ({"correlation": 0.52}, "noise costs 0.080 of the correlation; the bar is at 0.03"),
+        ({"correlation": 0.3}, f"correlation: {sensor.NEW} 0.300, paper 0.400; noise costs 0.300"),
+        ({"log_ratio": 1.5}, f"log ratio: {sensor.NEW} 1.500, paper 1.000"),
+        ({"still_hz": 0.9}, f"where frames are still, {sensor.NEW} fires 4.50 times the sensor's events"),
+        ({"still_hz": 0.06}, f"where frames are still, {sensor.NEW} fires 0.30 times the sensor's events"),
+        ({"still_hz": 0.9, "lamp": 0.9}, ""),
+    ],
+)
+def test_each_bar_is_judged_by_its_own_figure(changed: dict[str, float], said: str) -> None:
+    """A lamp, which frames do not show, is not held against a simulator."""
+    given = {"correlation": 0.6, "log_ratio": 0.5, "still_hz": 0.3, "sensor_still_hz": 0.2, "steps": 3, "lamp": 0.1}
+    others = {"paper": {"correlation": 0.4, "log_ratio": 1.0}, f"{sensor.NEW}, quiet": {}, sensor.NEW: changed}
+    rows = [
+        {"recording": recording, "simulator": name, "at": "own", "stated": True, **given, **own}
+        for recording in ("a", "b", "all")
+        for name, own in others.items()
+    ]
+    for row in rows:
+        if row["recording"] == "all":
+            del row["lamp"]
+    assert "; ".join(sensor.missed(rows)).startswith(said)
+    assert bool(sensor.missed(rows)) == bool(said)
+    assert sensor.missed([dict(row, stated=False) for row in rows]) == []
 
 
 def test_what_the_odd_stripes_show_chooses_nothing() -> None:
@@ -229,19 +285,24 @@ def test_rows_stay_when_a_peer_fails_and_one_recording_is_no_verdict(
     monkeypatch.setattr(sensor, "seen", lambda path: (made, "toy: 5 steps"))
     monkeypatch.setattr(sensor, "RECIPES", ("paper", sensor.NEW))
     (toys / "v2ecore" / "emulator.py").write_text("EventEmulator = int")
+    (toys / "eventcv.py").write_text("import sys\ndef simulate(frames, **rest):\n    sys.exit(1)")
     out = tmp_path / "rows.json"
     written = list[int]()
     monkeypatch.setattr(sensor, "write_json", lambda path, rows: written.append(len(rows)))
-    asked = asked_for(tmp_path / "toy.h5", peer=[f"v2e={toys}", f"openeb={toys}"], light=["linear"], json=out)
+    asked = asked_for(
+        tmp_path / "toy.h5", peer=[f"v2e={toys}", "eventcv=", f"openeb={toys}"], light=["linear"], json=out
+    )
     report = sensor.measure(asked)
     names = {row["simulator"] for row in report.records}
     assert "openeb" in names
-    assert "v2e" not in names
+    assert not {"v2e", "eventcv"} & names
     assert written == list(range(1, written[-1] + 1))  # a row at a time
-    assert len(report.missed) == 1
+    assert len(report.missed) == 2
     assert "peer v2e failed: TypeError" in report.missed[0]
+    assert "peer eventcv failed: SystemExit" in report.missed[1]
     assert any("at least 2 recordings" in line for line in report.lines)
-    assert "toy.h5, light linear: openeb, 7 of 7" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "toy.h5, light linear: openeb, 8 of 8\n  own: correlation " in said
 
 
 def test_an_unknown_peer_is_refused_with_the_known_ones(tmp_path: Path) -> None:

@@ -51,6 +51,7 @@ def _disconnect() -> None:
 
 
 def _install(fault: dict) -> None:
+    from v2v_server.store.recording import RecordedPixels
     from v2v_server.store.video_file import VideoFile
     from v2v_server.worker import process as worker
     from v2v_server.worker.making import make, read
@@ -75,7 +76,8 @@ def _install(fault: dict) -> None:
         return call
 
     read.decode_for = decoding
-    VideoFile.clips = before("decode", VideoFile.clips)
+    for pixels in (VideoFile, RecordedPixels):
+        pixels.clips = before("decode", pixels.clips)
     make.simulate_clip = before("simulate", simulate_clip)
     worker.sample_message = before("send", sample_message)
 

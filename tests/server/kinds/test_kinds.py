@@ -12,7 +12,9 @@ from v2v_protocol.errors import UsageError
 from v2v_server.kinds.kind import VideosKind
 from v2v_server.kinds.registry import KINDS, VIDEOS, kind_from, kind_of
 
-PATHS = ["a.mp4", "b/c.MKV", "d/0001.png", "e.tiff", "f.zip", "g/h.txt", "i", "j.masks/0.png"]
+TEXTS = {"marks": "20000events"}
+"""A value of each flag that is a text."""
+PATHS = ["a.mp4", "b/c.MKV", "d/0001.png", "e.tiff", "f.zip", "g/h.txt", "i", "j.masks/0.png", "k.h5.v2ve"]
 
 
 @st.composite
@@ -20,6 +22,10 @@ def stated(draw: st.DrawFn, kind: VideosKind) -> VideosKind:
     """Return the kind with any flags that it allows."""
     given_flags: dict[str, Any] = {"videos_kind": kind.name}
     for name, setting in kind.settings.items():
+        if setting.kind == "text":  # which excludes the others
+            if draw(st.booleans()):
+                return kind_from({"videos_kind": kind.name, name: TEXTS[name]})
+            continue
         wholes = st.integers(max(1, int(setting.low)), min(300, int(setting.high)))
         given_flags[name] = draw(st.just(setting.default) | wholes)
     return kind_from(given_flags)
@@ -36,7 +42,7 @@ def test_another_process_gets_the_kind_with_its_flags(kind: VideosKind, data: st
 @pytest.mark.parametrize(("name", "flag"), [(kind.name, flag) for kind in KINDS.values() for flag in kind.settings])
 def test_each_flag_makes_the_index_probe_again(name: str, flag: str) -> None:
     kind, setting = KINDS[name], KINDS[name].settings[flag]
-    value = {"whole": 12, "number": 7.0}[setting.kind]
+    value = {"whole": 12, "number": 7.0, "text": TEXTS.get(flag)}[setting.kind]
     changed = kind_from({"videos_kind": name, flag: value})
     assert changed.mark(changed.rate_of(None)) != kind.mark(kind.rate_of(None))
     assert 0 <= changed.mark(changed.rate_of(None)) < 2**62
@@ -46,11 +52,11 @@ def test_each_flag_makes_the_index_probe_again(name: str, flag: str) -> None:
 def test_a_flag_of_another_kind_is_refused(name: str, flag: str) -> None:
     having = [kind.name for kind in KINDS.values() if flag in kind.settings]
     for other in KINDS.keys() - set(having):
-        words = (
-            f"--{flag.replace('_', '-')} 9.* has no effect without --videos-kind {' or '.join(having)} .now {other}."
-        )
+        value = TEXTS.get(flag, 9)
+        needed = f"--videos-kind {' or '.join(having)} .now {other}."
+        words = f"--{flag.replace('_', '-')} {value}.* has no effect without {needed}"
         with pytest.raises(UsageError, match=words):
-            kind_from({"videos_kind": other, flag: 9})
+            kind_from({"videos_kind": other, flag: value})
         assert kind_from({"videos_kind": other, flag: KINDS[name].settings[flag].default}) == KINDS[other]
 
 

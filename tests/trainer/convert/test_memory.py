@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from trainer.convert import convert
-from v2v_recordings import hdf5, text_events
+from v2v_recordings import hdf5, item_writer, text_events
 from v2v_recordings import layout_writer as writer
 
 
@@ -34,8 +34,8 @@ def write_text(path: Path, events: int) -> Path:
 
 @pytest.mark.parametrize("write", [write_mvsec, write_text])
 def test_peak_memory_is_that_of_the_buffers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write: object) -> None:
-    monkeypatch.setattr(writer, "FLUSH_EVENTS", 4096)
-    monkeypatch.setattr(writer, "REORDER_EVENTS", 1024)
+    monkeypatch.setattr(item_writer, "FLUSH_EVENTS", 4096)
+    monkeypatch.setattr(item_writer, "REORDER_EVENTS", 1024)
     monkeypatch.setattr(writer, "H5_CHUNK", 1024)
     monkeypatch.setattr(hdf5, "READ_EVENTS", 1024)
     monkeypatch.setattr(text_events, "BLOCK_BYTES", 1 << 14)

@@ -18,6 +18,7 @@ from v2v_protocol.events import EventList, whole_edges
 from v2v_protocol.sample import ARRAYS, Needs, Provenance, Sample, SampleId, needs_of, new_arrays, sidecar_endings
 from v2v_protocol.spec import MARGIN_PX
 from v2v_server.flow import flow_for
+from v2v_server.kinds.registry import kind_of
 from v2v_server.motion import levels_of
 from v2v_server.simulation.clip import simulate_clip
 from v2v_server.simulation.intensity import eight_bits
@@ -56,20 +57,25 @@ def make_sample(
     """
     plan, clip, stamp = decoded.plan, job.clip, job.stamp
     arrays = new_arrays(clip.layout) if into is None else into
-    context, irregular = sample_context(clip, decoded, needs_of(arrays), sidecars)
-    unlabelled = {
+    known, unlabelled = (
+        decoded.clip.arrays,
+        {name: f"{clip.video}: {why}" for name, why in decoded.clip.unlabelled.items() if name in arrays},
+    )
+    context, irregular = sample_context(clip, decoded, needs_of(set(arrays) - unlabelled.keys()), sidecars)
+    unlabelled |= {
         name: f"{clip.video}: its frame rate is unknown, and {name} needs it"
         for name in arrays
         if not context.can_time(name)
     }
-    if any(ARRAYS[name].needs.events for name in arrays if name not in unlabelled):
-        of_kernel = {name: arrays[name] for name in NAMES if name in arrays and name not in unlabelled}
+    left = [name for name in arrays if name not in known and name not in unlabelled]
+    if any(ARRAYS[name].needs.events for name in left):
+        of_kernel = {name: arrays[name] for name in NAMES if name in left}
         context = replace(context, simulated=simulate(context, of_kernel))
     dropped = dict[str, int]()
     for name, array in arrays.items():
-        if name in decoded.clip.arrays:
-            array[...] = decoded.clip.arrays[name]
-        elif name not in NAMES and name not in unlabelled:
+        if name in known:
+            array[...] = known[name]
+        elif name in left and name not in NAMES:
             try:
                 with errors_of_sidecar(clip.video, name, sidecars, clip.refused_sidecars):
                     dropped[name] = ARRAY_BUILDERS[name](context, array) or 0
@@ -80,7 +86,7 @@ def make_sample(
     for name in unlabelled:
         arrays[name][...] = ARRAYS[name].empty
     made = context.simulated
-    saturated = {} if made is None else dict(made.saturated)
+    saturated = dict(decoded.clip.saturated if made is None else made.saturated)
     saturated_bins = saturated.pop("voxels", 0)
     return Sample(
         arrays=arrays,
@@ -177,8 +183,13 @@ def simulate(context: SampleContext, out: Mapping[str, npt.NDArray[Any]]) -> Vox
     """Simulate the sample into ``out``, arrays that the kernel makes, such as voxels [T, bins, H, W], by name.
 
     Raises:
-        VideoError: thresholds or time stamps that the corpus states for the video are beyond what can be simulated.
+        VideoError: thresholds or time stamps that the corpus states for the video are beyond what can be simulated; or
+            it is a recording.
     """
+    if not kind_of(context.video).is_simulated:
+        raise VideoError(
+            context.video, None, "has events of its own, so none are simulated: take them from its raw file"
+        )
     try:
         return simulate_clip(
             context.view,
