@@ -46,6 +46,7 @@ BENCHES = {
     "worlds": "accuracy.worlds",
     "fit": "accuracy.fit",
     "sensor": "accuracy.sensor",
+    "noise": "accuracy.noise",
     "scene": "accuracy.scene",
     "defects": "accuracy.defects",
     "flow": "accuracy.flow",

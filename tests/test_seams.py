@@ -75,7 +75,7 @@ EFFECT_LINES = (
     ("v2v_protocol/recipe.py", "    dead_pixel_share: Range =",
      '    event_loss: Range = span((0.0, 0.0), 0.0, 0.99, "chance that the events of a step get lost")\n'
      '    threshold_tilt: Range = span((0.0, 0.0), -0.99, 0.99, "tilt of the thresholds, either way",\n'
-     '        worst=lambda tilt, _: Worst(1 - abs(tilt), 1 + abs(tilt)))\n'),
+     '        worst=lambda tilt, *_: Worst(1 - abs(tilt), 1 + abs(tilt)))\n'),
     ("v2v_server/simulation/effects/__init__.py", '        "dead_pixels",',
      '        "event_loss",\n        "threshold_tilt",\n'),
 )  # fmt: skip

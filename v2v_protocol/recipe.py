@@ -59,7 +59,7 @@ LARGEST_EVENTS = 2.0**49
 
 
 class Worst(NamedTuple):
-    """The most that an effect does to a pixel in a clip: ``worst(value, seconds)`` of its field.
+    """The most that an effect does to a pixel in a clip: ``worst(value, steps, seconds)`` of its field.
 
     Attributes:
         smallest, largest: limits of the pixel's thresholds, as multiples of the nominal ones.
@@ -71,15 +71,15 @@ class Worst(NamedTuple):
     change: float = 0.0
 
 
-def worst_of(effects: Mapping[str, Collection[float]], seconds: float) -> Worst:
+def worst_of(effects: Mapping[str, Collection[float]], steps: int, seconds: float) -> Worst:
     """Return the most that effects do together.
 
     Args:
         effects: by field, the value of each, or the ends of its range.
-        seconds: duration of the clip.
+        steps, seconds: length of the clip.
     """
     cases = [
-        [setting.worst(value, seconds) for value in effects[name]]
+        [setting.worst(value, steps, seconds) for value in effects[name]]
         for name, setting in effect_settings().items()
         if setting.worst is not None and name in effects
     ]
@@ -411,7 +411,7 @@ class Recipe(Persisted):
         (0.0, 0.0), 0.0, 1.0, "standard deviation of each pixel's thresholds, as a share of the nominal ones",
         group=EFFECTS_SECTION,
         usual=(0.0, 0.3), mistake="Many pixels would fire far too easily. Divide percent by 100.",
-        worst=lambda sigma, _: Worst(
+        worst=lambda sigma, *_: Worst(
             max(1.0 - LARGEST_NORMAL * sigma, SMALLEST_THRESHOLD_SHARE), 1.0 + LARGEST_NORMAL * sigma
         ),
     )  # fmt: skip
@@ -429,7 +429,7 @@ class Recipe(Persisted):
         unit="Hz",
         usual=(0.0, 20.0),
         mistake="Every pixel would fire {0:g} events a second without a change. Divide millihertz by 1000.",
-        worst=lambda rate_hz, seconds: Worst(change=rate_hz * seconds),
+        worst=lambda rate_hz, _, seconds: Worst(change=rate_hz * seconds),
     )
     refractory_seconds: Range = span(
         (0.0, 0.0),
@@ -458,6 +458,16 @@ class Recipe(Persisted):
         usual=(0.0, 0.05),
         mistake="It is a share: divide percent by 100.",
     )
+
+    noise_band_share: Range = span(
+        (0.0, 0.0), 0.0, 10.0, "standard deviation of noise below noise_band_hz, as a share of the mean threshold",
+        is_later=True, usual=(0.0, 0.4), mistake="Still pixels would fire without a pause. Divide percent by 100.",
+        worst=lambda share, steps, _: Worst(change=8.0 * share * steps),
+    )  # fmt: skip
+    noise_band_hz: Range = span(
+        (0.0, 0.0), 0.01, 1e4, "corner frequency of the noise of noise_band_share", unit="Hz", off=True, is_later=True,
+        usual=(1.0, 300.0), mistake="Noise of {0:g} Hz was not measured in a sensor.",
+    )  # fmt: skip
 
     world_speed_px: Range = span(
         (0.0, 0.0), 1e-3, 1e4,
@@ -528,6 +538,11 @@ class Recipe(Persisted):
                     f"recipe {name} = {getattr(self, name)}: the duration of a grid is that of voxel_seconds "
                     f"({format_value(self.voxel_seconds)}): set {name} to {alone}, or voxel_seconds to 0"
                 )
+        if any(self.noise_band_share) and not any(self.noise_band_hz):
+            raise RecipeError(
+                f"recipe noise_band_share = {format_value(self.noise_band_share)}: set noise_band_hz, the corner of "
+                "this noise, too"
+            )
         for name in self.log_drawn:
             low, high = getattr(self, name)
             if low <= 0.0 and low < high:
@@ -724,7 +739,7 @@ class Recipe(Persisted):
         unit = step_seconds if self.noise_unit == "second" else 1.0
         steps = self.spans * int(self.steps_at(self.frame_stride / step_seconds))
         segments = self.most_segments(steps) + steps * levels_per_step
-        worst = worst_of({name: getattr(self, name) for name in effect_settings()}, steps * step_seconds)
+        worst = worst_of({name: getattr(self, name) for name in effect_settings()}, segments, steps * step_seconds)
         return most_events(segments, ends, (low, high), steps * (sigma * math.sqrt(unit) + hot * unit), *worst)
 
     def warn(self, say: Callable[[str], object] = _LOG.warning) -> None:

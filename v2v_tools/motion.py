@@ -281,5 +281,6 @@ def noise_rate(params: SampleParams, step_seconds: float) -> float:
         (threshold / sigma) ** 2 steps on average.
     """
     share = params.noise_sigma / min(params.threshold_pos, params.threshold_neg)
-    hertz = sum(float(params.effects.get(name, 0.0)) for name in NOISE)
+    known = effect_settings()
+    hertz = sum(float(params.effects.get(name, 0.0)) for name in NOISE if known[name].unit == "Hz")
     return share**2 / (1.0 + share) + hertz * step_seconds

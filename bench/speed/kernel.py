@@ -8,7 +8,7 @@ pinned to the same core; the kernel's process keeps freed memory, as every worke
 The fastest run is what the code costs. The median shows neighbours on the same physical core, which slow vector code.
 
 Bars: the kernel's fastest run is at least 40 times as fast as the loop's; all effects take at most 4 times as long as
-none.
+none; with noise below a corner in place of shot noise, they take at most 1.4 times as long.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from v2v_protocol.command import Parser
 from v2v_server.simulation import simulate
 from v2v_server.system.process import keep_freed_memory
 
-BAR, EFFECTS_BAR = 33.0, 4.0
+BAR, EFFECTS_BAR, BAND_BAR = 33.0, 4.0, 1.4
 STEPS, SIDE_PX, HOT_PIXELS = 200, 128, 16
 _CAMERA: dict[str, Any] = {"threshold_pos": 0.2, "threshold_neg": 0.25}
 _NOISE = {"noise_sigma": 0.05, "hot_pixel_count": HOT_PIXELS, "hot_pixel_sigma": 5.0, "seed": 1}
@@ -39,13 +39,21 @@ _EFFECTS = {
     "threshold_mismatch_sigma": 0.15, "shot_noise_hz": 5.0, "leak_hz": 0.1, "refractory_seconds": 5e-4,
     "photoreceptor_hz": 100.0, "dead_pixel_share": 2 / 128**2, "frames_per_second": 25.0,
 }  # fmt: skip
+_BAND = {"shot_noise_hz": 0.0, "noise_band_share": 0.2, "noise_band_hz": 30.0}
 SETTINGS: dict[str, dict[str, Any]] = {
     "kernel": _NOISE,
     "kernel_without_noise": {},
     "kernel_all_effects": _NOISE | _EFFECTS,
+    "kernel_noise_band": _NOISE | _EFFECTS | _BAND,
 }
 RELEASED = "released"
-_RUNS_PER_TURN = {RELEASED: 1, "kernel": 30, "kernel_without_noise": 30, "kernel_all_effects": 10}
+_RUNS_PER_TURN = {
+    RELEASED: 1,
+    "kernel": 30,
+    "kernel_without_noise": 30,
+    "kernel_all_effects": 10,
+    "kernel_noise_band": 10,
+}
 _COLUMNS: tuple[Column, ...] = (
     ("name", "", "{}", 1),
     ("cpu_seconds_per_sample", "CPU ms a sample", "{:.2f}", 1e3),
@@ -125,8 +133,13 @@ def records_of(seconds: dict[str, list[float]]) -> list[dict[str, Any]]:
 def missed(records: Sequence[Record]) -> list[str]:
     """Return the bars that these records miss."""
     found = {record["name"]: record["ratio_to_released"] for record in records}
-    ratios = {"ratio_to_released": found["kernel"], "times_of_effects": found["kernel"] / found["kernel_all_effects"]}
-    return beyond("kernel", ratios, least={"ratio_to_released": BAR}, most={"times_of_effects": EFFECTS_BAR})
+    ratios = {
+        "ratio_to_released": found["kernel"],
+        "times_of_effects": found["kernel"] / found["kernel_all_effects"],
+        "times_of_noise_band": found["kernel_all_effects"] / found["kernel_noise_band"],
+    }
+    most = {"times_of_effects": EFFECTS_BAR, "times_of_noise_band": BAND_BAR}
+    return beyond("kernel", ratios, least={"ratio_to_released": BAR}, most=most)
 
 
 def add_flags(parser: Parser) -> None:

@@ -109,6 +109,10 @@ PORTABLE: Mapping[str, Row] = {
     "voxels_bilinear": Row(FINE, ("voxels_bilinear",)),
     "time_surface": Row(FINE, ("time_surface", "voxels")),
     "time_surface of effects": Row("davis346", ("time_surface",), {"voxel_dtype": "float32"}),
+    "noise below a corner": Row(
+        FINE | {"noise_band_share": (0.15, 0.3), "noise_band_hz": (15.0, 60.0), "refractory_seconds": (1e-4, 1e-3)},
+        (*_EVENTS, "time_surface"),
+    ),
     "frames_rgb": Row({}, ("frames_rgb",)),
     "frames_u16": Row({}, ("frames_u16",)),
     "frames_all": Row({"pause_probability": 0.2}, ("frames_all",)),

@@ -72,6 +72,8 @@ OTHER_RECIPE_VALUES: dict[str, Any] = {
     "refractory_seconds": [0.0, 0.001],
     "photoreceptor_hz": [30.0, 300.0],
     "dead_pixel_share": [0.0, 0.001],
+    "noise_band_share": [0.1, 0.2],
+    "noise_band_hz": 30.0,
 }
 OTHER_SPEC_VALUES: dict[str, Any] = {
     "recipe": preset("paper-flow"),
@@ -165,7 +167,8 @@ def test_a_stream_preset_may_name_a_recipe_which_other_fields_change() -> None:
 def test_every_field_changes_the_digest() -> None:
     digests = {StreamSpec().digest}
     for name, value in OTHER_RECIPE_VALUES.items():
-        digests.add(StreamSpec.from_dict({"recipe": {name: value}}).digest)
+        beside = {"noise_band_hz": 20.0} if name == "noise_band_share" else {}
+        digests.add(StreamSpec.from_dict({"recipe": {name: value, **beside}}).digest)
     for name, value in OTHER_SPEC_VALUES.items():
         auto = {"scene": "auto"}
         needed = {"sibling_spacing": {"samples_per_decode": 3}, "moving_share": auto, "quiet_share": auto}.get(name, {})

@@ -123,7 +123,7 @@ class KernelInput:
     def worst(self) -> Worst:
         """The most that the effects do."""
         drawn = self.params.effects.items()
-        return worst_of({name: (value,) for name, value in drawn}, math.fsum(self.step_seconds))
+        return worst_of({name: (value,) for name, value in drawn}, self.segments, math.fsum(self.step_seconds))
 
     def timeline(self) -> Timeline:
         """Divide the clip into segments."""
@@ -335,7 +335,8 @@ class _General:
         )  # fmt: skip
         self._tables = effects.prepare(
             params.effects, params.noise_key, given.intensity or Intensity(1.0, 1.0),
-            given.step_seconds[part.step] * part.share, self._pixels, real, carried.segments,
+            given.step_seconds[part.step] * part.share, self._pixels, real,
+            (params.threshold_pos, params.threshold_neg), carried.segments,
         )  # fmt: skip
 
     def run(self, arrays: Mapping[str, npt.NDArray[Any]], listing: Listing = _NO_LIST) -> dict[str, int]:

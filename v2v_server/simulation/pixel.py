@@ -131,6 +131,27 @@ def smallest_words(key: noise.NoiseKey, purpose: int, count: int, pixels: int) -
     return np.flatnonzero(place_words <= largest).astype(np.int64)
 
 
+@numba.njit(nogil=True)
+def minus_two_ln(word):
+    """Return -2 ln (word / 2**31) of a word, uint32, 1 to 2**31 - 1: float32 (``noise.py``)."""
+    bits: Any = bits_of_float(np.float32(np.int32(word)))  # type: ignore[call-arg]
+    exponent = np.int32(np.int32(bits - noise.SQRT_HALF_BITS) >> np.int32(23))
+    fraction = float_of_bits(np.int32(bits - np.int32(exponent << np.int32(23)))) - _ONE
+    square = fraction * fraction
+    high = (_L2 + _L3 * fraction) + _L4 * square
+    log = np.float32(np.int32(exponent - np.int32(31))) * noise.MINUS_2_LN_2
+    return log + fraction * ((_L0 + _L1 * fraction) + high * square)
+
+
+@numba.njit(nogil=True)
+def half_mixed(x):
+    """Return the first half of ``noise.mix`` of a word, uint32."""
+    x = np.uint32(x ^ (x >> np.uint32(16)))
+    x = np.uint32(x * _M0)
+    x = np.uint32(x ^ (x >> np.uint32(15)))
+    return np.uint32(x * _M1)
+
+
 @numba.njit(nogil=True, inline="always")
 def two_normals(radius_words, angle_words, radius_word, angle_word, x_row, y_row, radius_row, normal):
     """Write ``noise.mix`` and ``noise.box_muller`` of a block to ``normal`` [2, block], using the three other rows.
@@ -139,11 +160,7 @@ def two_normals(radius_words, angle_words, radius_word, angle_word, x_row, y_row
     chain of dependent operations fills that window with a single iteration.
     """
     for i in range(PIXELS_A_BLOCK):
-        x = np.uint32(radius_words[i] ^ radius_word)
-        x = np.uint32(x ^ (x >> np.uint32(16)))
-        x = np.uint32(x * _M0)
-        x = np.uint32(x ^ (x >> np.uint32(15)))
-        x = np.uint32(x * _M1)
+        x = half_mixed(np.uint32(radius_words[i] ^ radius_word))
         y = np.uint32(np.uint32(x ^ (x >> np.uint32(15))) ^ np.uint32(angle_words[i] ^ angle_word))
         x_row[i] = np.uint32((x & _LOW_31_BITS) | np.uint32(1))
         y_row[i] = np.uint32(y * _M2)

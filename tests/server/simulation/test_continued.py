@@ -21,7 +21,7 @@ from v2v_server.simulation.voxel import Levels, Moments
 STEPS = 12
 EFFECTS = {
     "threshold_mismatch_sigma": 0.15, "shot_noise_hz": 20.0, "leak_hz": 3.0, "refractory_seconds": 0.005,
-    "photoreceptor_hz": 20.0, "dead_pixel_share": 0.02,
+    "photoreceptor_hz": 20.0, "dead_pixel_share": 0.02, "noise_band_share": 0.3,
 }  # fmt: skip
 STEP_US = np.tile([40_000.0, 33_333.25, 20_000.5], STEPS // 3)
 SINCE_US = np.concatenate(([0.0], np.cumsum(STEP_US)))
@@ -57,7 +57,10 @@ def columns(*events: EventList) -> list[Any]:
 def test_pieces_have_the_events_of_one_run(
     real: Any, names: set[str], cuts: set[int], most: int, has_levels: bool
 ) -> None:
-    given = clip_of({name: EFFECTS[name] for name in names}, has_levels=has_levels)
+    effects = {name: EFFECTS[name] for name in names}
+    if "noise_band_share" in names:
+        effects["noise_band_hz"] = 30.0  # both forms of its law: steps of .04 s, and their parts
+    given = clip_of(effects, has_levels=has_levels)
     clip = ContinuedClip(real, most)
     found = list[EventList]()
     for first, last in zip((0, *sorted(cuts)), (*sorted(cuts), STEPS), strict=True):

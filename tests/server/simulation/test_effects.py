@@ -184,6 +184,7 @@ def pan(steps: int, px_per_frame: float) -> np.ndarray:
 SCENES: dict[str, tuple[np.ndarray, dict[str, Any]]] = {
     "threshold_mismatch_sigma": (pan(50, 1.0), {"threshold_mismatch_sigma": 0.15}),
     "shot_noise_hz": (still(20, 50, 48, 48), {"shot_noise_hz": 5.0}),
+    "noise_band_share": (still(128, 50, 48, 48), {"noise_band_share": 0.25, "noise_band_hz": 30.0}),
     "leak_hz": (still(128, 50, 48, 48), {"leak_hz": 0.1}),
     "refractory_seconds": (pan(50, 4.0), {"refractory_seconds": 1e-3}),
     "photoreceptor_hz": (pan(50, 2.0), {"photoreceptor_hz": 30.0}),

@@ -3,6 +3,7 @@
     mismatch.py       every pixel has its own thresholds
     photoreceptor.py  a low-pass filter, slower in the dark
     leak.py           positive events without a change of brightness
+    noise_band.py     band-limited noise of the log intensity
     refractory.py     a pixel fires no events for a time after an event
     shot_noise.py     events of either sign, most in the dark
     dead_pixels.py    pixels that never fire
@@ -14,7 +15,7 @@ that it does) and one file here, named in :data:`EFFECTS`. The file states the e
 
     FIELD                     the recipe's field
     ROWS                      the number of rows of a block's state that it needs
-    NOISE                     whether it fires where nothing moves: its value is then a rate in Hz
+    NOISE                     whether it fires where nothing moves: a value in Hz is then the rate
     PURPOSES                  purposes of its words of noise (``noise.py``), numbers that no other effect has; if any
     PANEL                     the panel of ``v2v-fit`` that shows it: "rates", "still", "pixels" or "intervals"
     prepare(value, clip)      its tables; for the value 0 they have the same types and switch everything off
@@ -24,13 +25,15 @@ and, compiled, any of these functions. Each does nothing if the tables say off:
     start(tables, own, block, at)     before the first step of a block of pixels; may change the block's thresholds
     see(tables, own, block, at)       may replace ``block.change``, the change of log intensity in this step
     change(tables, own, block, at)    may add to ``block.change``
-    cross(tables, own, block, at)     may decide ``block.signed`` and ``block.residual`` itself; then it returns True
-    after(tables, own, block, at)     may change ``block.rises`` and ``block.falls``, the events of this step, and
-                                      ``block.residual``
+    divide(tables, own, block, at)    may divide the step into legs, ``block.legs`` and ``block.shares``; then it
+                                      returns True
+    cross(tables, own, block, at)     may decide ``block.residual`` and the events itself: ``block.rises``,
+                                      ``block.falls`` and, for their times, ``block.signed``; then it returns True
+    after(tables, own, block, at)     may change ``block.rises`` and ``block.falls``, the events, and ``block.residual``
 
-Within a step: see, noise, change, hot drift, cross, after. Effects run in the order of :data:`EFFECTS`. The names of
-``block`` and ``at`` are in :mod:`v2v_server.simulation.effects.state`. ``docs/effects.md`` gives sources, differences
-from them, and values; ``docs/extending.md`` shows how to add an effect.
+Within a step: see, noise, change, hot drift, divide; then, once or for each leg, cross and after. Effects run in the
+order of :data:`EFFECTS`. The names of ``block`` and ``at`` are in :mod:`v2v_server.simulation.effects.state`.
+``docs/effects.md`` gives sources, differences from them, and values; ``docs/extending.md`` shows how to add an effect.
 """
 
 from __future__ import annotations
@@ -53,6 +56,7 @@ EFFECTS: tuple[Any, ...] = tuple(
         "mismatch",
         "photoreceptor",
         "leak",
+        "noise_band",
         "refractory",
         "shot_noise",
         "dead_pixels",
@@ -70,6 +74,7 @@ def prepare(
     step_seconds: npt.NDArray[np.float64],
     pixels: int,
     real: Real,
+    thresholds: tuple[float, float],
     first: int = 0,
 ) -> tuple[Any, ...]:
     """Return the tables of every effect for one clip, in the order of :data:`EFFECTS`.
@@ -81,13 +86,15 @@ def prepare(
         step_seconds: [steps] duration of each step, which is a segment (``voxel.Timeline``).
         pixels: number of pixels of the picture.
         real: arithmetic of the pixels, float32 or float64.
+        thresholds: nominal ones, positive and negative, log units.
         first: number of the first step; above 0 for a clip that continues another one.
 
     Raises:
-        UsageError: more shot events in a step than can be drawn.
+        UsageError: more shot events in a step than can be drawn, or noise of a band without a corner.
     """
     durations, table_of_step = np.unique(step_seconds, return_inverse=True)
     clip = Clip(
-        linear_light(*intensity), step_seconds, durations, table_of_step.astype(np.int64), pixels, real, key, first
-    )
+        linear_light(*intensity), step_seconds, durations, table_of_step.astype(np.int64), pixels, real, key, values,
+        thresholds, first,
+    )  # fmt: skip
     return tuple(effect.prepare(values.get(effect.FIELD, 0.0), clip) for effect in EFFECTS)

@@ -18,7 +18,7 @@ import numpy as np
 
 from v2v_server.simulation import noise
 from v2v_server.simulation.effects import EFFECTS
-from v2v_server.simulation.effects.state import At, Block, compiled, hook
+from v2v_server.simulation.effects.state import LEGS, At, Block, compiled, hook
 from v2v_server.simulation.pixel import (
     PITCH,
     PIXELS_A_BLOCK,
@@ -33,11 +33,12 @@ from v2v_server.simulation.pixel import (
 from v2v_server.simulation.representations import REPRESENTATIONS, Counts, Train
 from v2v_server.simulation.vectors import aligned_rows, use_widest_vectors
 
-_UNIT = np.float32(2.0**-24)
+_UNIT, _WHOLE = np.float32(2.0**-24), np.float32(1)
 _FIRST_ROW = (0, *accumulate(effect.ROWS for effect in EFFECTS))
 ROWS = _FIRST_ROW[-1]
 """Rows of a block's state that the effects need."""
-_CARRIED = (0, *range(16, 16 + ROWS))
+_OWN = 17 + LEGS
+_CARRIED = (0, *range(_OWN, _OWN + ROWS))
 """Rows of a block's state that outlive a clip: the residual, and those of the effects."""
 FIXED, UNIFORM, TRIANGULAR = range(3)
 """How residuals start."""
@@ -114,7 +115,7 @@ def _counted(number: int, function: Any, rest: Any) -> Any:
 
 
 _start, _see, _change, _after = (_linked(EFFECTS, name, _each) for name in ("start", "see", "change", "after"))
-_cross = _linked(EFFECTS, "cross", _until_true)
+_divide, _cross = (_linked(EFFECTS, name, _until_true) for name in ("divide", "cross"))
 _begin, _events, _end = (
     _linked(tuple(REPRESENTATIONS.values()), name, _counted) for name in ("begin", "events", "end")
 )
@@ -133,11 +134,12 @@ def _simulate(
     # One by one: rows that are unpacked from an array have unknown strides, and their loops are not vectorised.
     residual, change, signed, positive, negative, rises = state[0], state[1], state[2], state[3], state[4], state[5]
     falls, waited, blind, on, off, old = state[6], state[7], state[8], state[9], state[10], state[11]
-    levels, own = state[12:16], state[16:]
+    shares, legs = state[16], state[17:_OWN]
+    levels, own = state[12:16], state[_OWN:]
     radius_words, angle_words, normal = words[4], words[5], floats[4:]
     block = Block(
         residual, change, signed, rises, falls, waited, blind, timed, positive, negative, levels, words[:4],
-        floats[:4], tolerance, key,
+        floats[:4], tolerance, key, legs, shares,
     )  # fmt: skip
     zero = tolerance - tolerance
     start_folds, time_folds = folds_of(key, noise.START), folds_of(key, noise.TIME)
@@ -167,6 +169,9 @@ def _simulate(
             for row in range(len(carried)):
                 for i in range(last - first):
                     state[_CARRIED[row], i] = carried[row, first + i]
+        if timed:
+            for i in range(PIXELS_A_BLOCK):
+                old[i], waited[i], blind[i] = residual[i], zero, zero
         if noisy:
             for i in range(PIXELS_A_BLOCK):
                 radius_words[i] = word(pixel_radius, first + i)
@@ -225,32 +230,38 @@ def _simulate(
                     for i in range(PIXELS_A_BLOCK):
                         change[i] += normal[odd, i] * scale
                 _change(tables, own, block, at)
-                if timed:
-                    for i in range(PIXELS_A_BLOCK):
-                        old[i], waited[i], blind[i] = residual[i], zero, zero
                 drifting = residual if drifts_first else change
                 for spot in range(hot, next_hot):
                     drifting[hot_position[spot] - first] += hot_drift[spot] * segments.hot_scale[each]
-                if _cross(tables, own, block, at):
-                    for i in range(PIXELS_A_BLOCK):
-                        rises[i], falls[i] = max(signed[i], zero), max(zero - signed[i], zero)
-                else:
-                    for i in range(PIXELS_A_BLOCK):
-                        events, residual[i] = crossed(residual[i] + change[i], positive[i], negative[i], tolerance)
-                        signed[i], rises[i], falls[i] = events, max(events, zero), max(zero - events, zero)
-                _after(tables, own, block, at)
-                if is_first:
-                    for i in range(PIXELS_A_BLOCK):
-                        on[i], off[i] = rises[i], falls[i]
-                else:
-                    for i in range(PIXELS_A_BLOCK):
-                        on[i] += rises[i]
-                        off[i] += falls[i]
-                if timed:
-                    if drifts_first:
-                        for spot in range(hot, next_hot):
-                            change[hot_position[spot] - first] += hot_drift[spot] * segments.hot_scale[each]
-                    _time(each, segments.first + each, block, old, first, last, time_folds, made, clipped)
+                is_divided, begun = _divide(tables, own, block, at), zero
+                if not is_divided:
+                    shares[0] = _WHOLE
+                parts = LEGS if is_divided else 1
+                for leg in range(parts):
+                    at = At(first, each, moved, before, now, shown, shares[leg], begun, leg == parts - 1)
+                    if is_divided:
+                        for i in range(PIXELS_A_BLOCK):
+                            change[i] = legs[leg, i]
+                    if not _cross(tables, own, block, at):
+                        for i in range(PIXELS_A_BLOCK):
+                            events, residual[i] = crossed(residual[i] + change[i], positive[i], negative[i], tolerance)
+                            signed[i], rises[i], falls[i] = events, max(events, zero), max(zero - events, zero)
+                    _after(tables, own, block, at)
+                    if is_first and leg == 0:
+                        for i in range(PIXELS_A_BLOCK):
+                            on[i], off[i] = rises[i], falls[i]
+                    else:
+                        for i in range(PIXELS_A_BLOCK):
+                            on[i] += rises[i]
+                            off[i] += falls[i]
+                    if timed:
+                        if drifts_first:
+                            for spot in range(hot, next_hot):
+                                change[hot_position[spot] - first] += hot_drift[spot] * segments.hot_scale[each]
+                        _time(segments.first + each, block, at, old, last, time_folds, made, clipped)
+                        for i in range(PIXELS_A_BLOCK):
+                            old[i] = residual[i]
+                    begun += shares[leg]
             if each == count - 1 or segments.bin[each + 1] != of_bin:
                 net = on if is_plain else signed
                 if not is_plain:
@@ -263,18 +274,18 @@ def _simulate(
 
 
 @compiled
-def _time(each, number, block, old, first, last, folds, made, clipped):
-    """Give every event of a segment its time, and pass it to the representations.
+def _time(number, block, at, old, last, folds, made, clipped):
+    """Give every event of a segment, or of a leg of it, its time, and pass it to the representations.
 
     Crossings of one pixel come at equal distances. Events that no change of intensity caused (shot noise) come at
-    random times.
+    random times of the segment.
 
     Args:
         number: of the segment, for the noise.
-        old: [block] real, the residual at the start of the segment.
+        old: [block] real, the residual at its start.
         folds: of the noise's words for these times.
     """
-    found, count = block.words[0], 0
+    found, count, first = block.words[0], 0, at.first
     for pixel in range(last - first):  # without a branch: most pixels have no events
         found[count] = pixel
         count += block.rises[pixel] + block.falls[pixel] > 0
@@ -295,11 +306,12 @@ def _time(each, number, block, old, first, last, folds, made, clipped):
                 passed = min(max(block.waited[i] + (threshold - sign * np.float64(old[i])) / speed, 0.0), 1.0)
                 apart = min(apart, (1.0 - passed) / max(crossings - 1, 1))
             if crossings > 0:
-                _events(made, clipped, Train(first + i, i, each, is_rising, passed, apart, crossings))
+                passed, apart = at.begun + at.share * passed, at.share * apart
+                _events(made, clipped, Train(first + i, i, at.step, is_rising, passed, apart, crossings))
             for k in range(crossings, events):
                 drawn = word((word(folds, first + i), np.uint32(number)), np.uint32(2 * k + is_rising))
                 passed = np.float64(np.int64(drawn)) * 2.0**-32
-                _events(made, clipped, Train(first + i, i, each, is_rising, passed, 0.0, 1))
+                _events(made, clipped, Train(first + i, i, at.step, is_rising, passed, 0.0, 1))
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -332,7 +344,7 @@ def simulate_general(
             effects, [1, pixels].
         kept: the same at the end, written; of no rows if it is not wanted.
     """
-    state = aligned_rows(16 + ROWS, PITCH, table.dtype)
+    state = aligned_rows(_OWN + ROWS, PITCH, table.dtype)
     words = aligned_rows(6, PITCH, np.uint32)
     floats = aligned_rows(6, PITCH, np.float32)
     _simulate(

@@ -66,7 +66,7 @@ def cross(tables, own, block, at):
     """Fire events one after another in time."""
     refractory, seconds = tables
     if refractory > 0:
-        duration, blind = seconds[at.step], own[0]
+        duration, blind, zero = seconds[at.step] * at.share, own[0], block.tolerance - block.tolerance
         if block.timed:
             for i in range(PIXELS_A_BLOCK):
                 block.waited[i], block.blind[i] = blind[i] / duration, refractory / duration
@@ -75,5 +75,7 @@ def cross(tables, own, block, at):
                 block.residual[i], blind[i], block.change[i], duration, refractory, block.positive[i],
                 block.negative[i], block.tolerance,
             )  # fmt: skip
+        for i in range(PIXELS_A_BLOCK):
+            block.rises[i], block.falls[i] = max(block.signed[i], zero), max(zero - block.signed[i], zero)
         return True
     return False

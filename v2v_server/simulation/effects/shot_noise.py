@@ -16,7 +16,7 @@ from v2v_protocol.errors import UsageError
 from v2v_server.simulation import noise
 from v2v_server.simulation.effects.state import Clip, compiled, hook
 from v2v_server.simulation.intensity import Doubles, exponential
-from v2v_server.simulation.pixel import PIXELS_A_BLOCK, folds_of, look_up, word
+from v2v_server.simulation.pixel import PIXELS_A_BLOCK, folds_of, half_mixed, look_up, word
 from v2v_server.simulation.vectors import bits_of_float, use_widest_vectors
 
 FIELD, ROWS = "shot_noise_hz", 0
@@ -26,7 +26,7 @@ WHITE_SHOT_NOISE = 0.25
 """Shot noise of a white pixel as a share of a black one's (v2e)."""
 LARGEST_SHOT_MEAN = 64.0
 """Largest mean number of shot events of one polarity in a step."""
-_M0, _M1, _M2 = noise.MIX_FACTORS
+*_, _M2 = noise.MIX_FACTORS
 
 
 class Tables(NamedTuple):
@@ -108,8 +108,8 @@ def start(tables, own, block, at):
 
 @hook
 def after(tables, own, block, at):
-    """Add the events."""
-    if len(tables.shot) > 0:
+    """Add the events, once in a step."""
+    if len(tables.shot) > 0 and at.is_last:
         of_step, drawn = tables.table_of_step[at.step], tables.drawn
         _draw(drawn, tables.of_steps[0, at.step], tables.of_steps[1, at.step])
         _fire(
@@ -122,11 +122,7 @@ def after(tables, own, block, at):
 def _draw(drawn, step_pos, step_neg):
     """Write the ``shot_words`` of a block and one step into the last two rows of ``drawn``."""
     for i in range(PIXELS_A_BLOCK):
-        x = np.uint32(drawn[0, i] ^ step_pos)
-        x = np.uint32(x ^ (x >> np.uint32(16)))
-        x = np.uint32(x * _M0)
-        x = np.uint32(x ^ (x >> np.uint32(15)))
-        x = np.uint32(x * _M1)
+        x = half_mixed(np.uint32(drawn[0, i] ^ step_pos))
         y = np.uint32(np.uint32(x ^ (x >> np.uint32(15))) ^ np.uint32(drawn[1, i] ^ step_neg))
         drawn[2, i] = x
         drawn[3, i] = np.uint32(y * _M2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numba
@@ -25,6 +26,10 @@ hook: Any = numba.njit(forceinline=True, **_OPTIONS)
 """The same for an effect's functions, which are inlined into the kernel."""
 
 
+LEGS = 3
+"""Parts of a step that an effect divides."""
+
+
 class Clip(NamedTuple):
     """Inputs of an effect's tables.
 
@@ -36,6 +41,8 @@ class Clip(NamedTuple):
         pixels: number of pixels of the picture.
         real: arithmetic of the pixels, float32 or float64.
         key: key of the sample's noise.
+        effects: the draw, by field; missing fields are off.
+        thresholds: nominal ones, positive and negative, log units.
         first: number of the first step.
     """
 
@@ -46,6 +53,8 @@ class Clip(NamedTuple):
     pixels: int
     real: Real
     key: noise.NoiseKey
+    effects: Mapping[str, float]
+    thresholds: tuple[float, float]
     first: int = 0
 
 
@@ -54,16 +63,18 @@ class Block(NamedTuple):
 
     Attributes:
         residual: remaining change since the last event, log units.
-        change: change that this step adds to the residual, log units.
-        signed: signed crossings of a threshold in this step.
-        rises, falls: positive and negative events of this step.
-        waited, blind: shares of the step in which the pixel is blind at its start and after each event.
+        change: change that this step adds to the residual, log units; of a divided step, that of the leg.
+        signed: signed crossings of a threshold in this step or leg.
+        rises, falls: its positive and negative events.
+        waited, blind: shares of it in which the pixel is blind at its start and after each event.
         timed: whether events need times, and so ``waited`` and ``blind``.
         positive, negative: the thresholds of each pixel, log units.
         levels: rows of log intensity, see :class:`At`.
         words: [4] uint32 rows, and ``floats``: [4] float32 rows, free for use within one call.
         tolerance: real, see ``voxel.py``.
         key: [4] uint32, the noise key.
+        legs: [LEGS] rows for a step that is divided, the change of each leg.
+        shares: [LEGS] real, their shares of its time.
     """
 
     residual: Any
@@ -81,6 +92,8 @@ class Block(NamedTuple):
     floats: Any
     tolerance: Any
     key: Any
+    legs: Any
+    shares: Any
 
 
 class At(NamedTuple):
@@ -93,6 +106,9 @@ class At(NamedTuple):
         before, now: rows of ``Block.levels``: log intensity before and after the step.
         shown: [width] uint8 or uint16, grey levels of the frame at or after its end; narrower than the block at the
             end of the picture.
+        share, begun: share of the step's time that the leg takes, and that has passed before it; 1 and 0 for a step in
+            one piece.
+        is_last: whether it is the step's last leg.
     """
 
     first: Any
@@ -101,3 +117,6 @@ class At(NamedTuple):
     before: Any
     now: Any
     shown: Any
+    share: Any = 1
+    begun: Any = 0
+    is_last: Any = True
