@@ -13,6 +13,7 @@ from v2v_client import Batch, V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol.sample import Sample
 from v2v_protocol.spec import StreamSpec
+from v2v_server.kinds.registry import VIDEOS
 from v2v_server.status.client import StatusClient
 
 
@@ -22,7 +23,7 @@ def test_a_server_that_shares_makes_the_bytes_of_the_table(tmp_path: Path) -> No
     flags = ["--rows", str(ROWS), "--share-gib", "0.01", "--scene", "auto", "--cache", str(tmp_path / "cache")]
     flags += [f"--set={name}={value}" for name, value in SIZE.items()]
     videos, table = tmp_path / "videos", Table(TABLE)
-    rows = {name: row for name, row in PORTABLE.items() if not row.stream.recipe.is_world}  # that is, of videos
+    rows = {name: row for name, row in PORTABLE.items() if row.kind == VIDEOS.name}
     videos.mkdir()
     write_clips(videos)
     with LocalServer(videos, workers=2, flags=flags) as server:
