@@ -156,6 +156,11 @@ def trace(folder: Path, clip: Path, runs: int = RUNS) -> Way:
     return Way.common(ways)
 
 
+def _has_started(calls: Path) -> bool:
+    """Return whether the worker has confined itself a second time, which it does after the server's first answer."""
+    return any(file.read_text("utf-8").count("/sandbox.py:confine:") > 1 for file in calls.iterdir())
+
+
 def _traced(folder: Path, clip: Path) -> Way:
     (folder / "calls").mkdir()
     (folder / "site").mkdir()
@@ -173,7 +178,7 @@ def _traced(folder: Path, clip: Path) -> Way:
         )  # fmt: skip
         try:
             with StatusClient(address) as client:
-                while not client.get_status(_START_SECONDS)["is_ready"]:
+                while not (client.get_status(_START_SECONDS)["is_ready"] and _has_started(folder / "calls")):
                     time.sleep(0.1)
             program = _CONSUMER.replace("RECIPE", repr(RECIPE)).replace("QUIET", str(_QUIET_SECONDS))
             consumer = subprocess.run(
