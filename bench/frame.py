@@ -97,6 +97,32 @@ def medians(turns: Sequence[Mapping[str, float]]) -> dict[str, Any]:
     return {key: statistics.median(turn[key] for turn in turns) for key in turns[0]}
 
 
+def beside(turns: Sequence[Mapping[str, float]], base: str, most: Mapping[str, float]) -> Report:
+    """Return the report of ways to make samples, beside one of them.
+
+    Args:
+        turns: processor time of a sample in each turn, by the name of the way.
+        base: the way that the others are compared with.
+        most: bars: the largest ratio, by name.
+    """
+    records: list[Record] = [
+        {
+            "samples": name,
+            "cpu_seconds": min(turn[name] for turn in turns),
+            "ratio": statistics.median(turn[name] / turn[base] for turn in turns),
+        }
+        for name in turns[0]
+    ]
+    columns: list[Column] = [
+        ("samples", "samples", "{}", 1.0),
+        ("cpu_seconds", "cpu ms", "{:.1f}", 1e3),
+        ("ratio", f"x {base}", "{:.2f}", 1.0),
+    ]
+    judged = [each for each in records if each["samples"] in most]
+    missed = [text for each in judged for text in beyond(each["samples"], each, most={"ratio": most[each["samples"]]})]
+    return Report(records, [(records, columns)], [], missed)
+
+
 def ratios(name: str, mine: Iterable[float], base: Iterable[float]) -> dict[str, float]:
     """Return the ratios within turns, so that a drift of the machine cancels: median, lowest and highest."""
     each = [one / other for one, other in zip(mine, base, strict=True)]

@@ -13,16 +13,14 @@ Bar: ``photographs`` and ``fine``, at most 3.5 times a sample from the store.
 from __future__ import annotations
 
 import argparse
-import statistics
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import closing
 from itertools import count, islice
 from pathlib import Path
-from typing import Any
 
-from bench.frame import Column, Report, add_whole, beyond, progress
+from bench.frame import Report, add_whole, beside, progress
 from v2v_protocol.command import Parser
 from v2v_protocol.recipe import preset
 from v2v_protocol.sample import DEFAULT_ARRAYS
@@ -38,11 +36,6 @@ from v2v_tools.remake import RemadeSample, Remaker
 MOST_TIMES = 3.5
 PATCHES = 2
 SHARES, EXPOSURE_SECONDS = (1.0, 2.0, 4.0), 0.01
-_COLUMNS: tuple[Column, ...] = (
-    ("samples", "samples", "{}", 1.0),
-    ("cpu_seconds", "cpu ms", "{:.1f}", 1e3),
-    ("ratio", "x dense store", "{:.2f}", 1.0),
-)
 
 
 def patches_of(made: RemadeSample) -> int:
@@ -110,18 +103,5 @@ def measure(asked: argparse.Namespace) -> Report:
     """Run the bench."""
     with tempfile.TemporaryDirectory(prefix="v2v-photographs-") as folder:
         made = list(turns(asked, Path(folder)))
-    records: list[dict[str, Any]] = [
-        {
-            "samples": name,
-            "cpu_seconds": min(turn[name] for turn in made),
-            "ratio": statistics.median(turn[name] / turn["dense store"] for turn in made),
-        }
-        for name in made[0]
-    ]
-    missed = [
-        text
-        for record in records
-        if record["samples"] in ("photographs", f"photographs, fine, {preset('worlds-fine').world_change_share:g}")
-        for text in beyond(record["samples"], record, most={"ratio": MOST_TIMES})
-    ]
-    return Report(records, [(records, _COLUMNS)], [], missed)
+    judged = "photographs", f"photographs, fine, {preset('worlds-fine').world_change_share:g}"
+    return beside(made, "dense store", dict.fromkeys(judged, MOST_TIMES))

@@ -13,17 +13,15 @@ Bar: ``recording``, at most 1.5 times a sample from the store.
 from __future__ import annotations
 
 import argparse
-import statistics
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from bench.frame import Column, Report, add_whole, beyond, progress
+from bench.frame import Report, add_whole, beside, progress
 from v2v_protocol.command import Parser
 from v2v_protocol.recipe import preset
 from v2v_protocol.spec import StreamSpec
@@ -36,11 +34,6 @@ from v2v_tools.remake import Remaker
 
 MOST_TIMES = 1.5
 EVENTS_A_SECOND, PICTURE_HZ, WIDTH_PX, HEIGHT_PX = 1_000_000, 20, 346, 260
-_COLUMNS: tuple[Column, ...] = (
-    ("samples", "samples", "{}", 1.0),
-    ("cpu_seconds", "cpu ms", "{:.1f}", 1e3),
-    ("ratio", "x dense store", "{:.2f}", 1.0),
-)
 
 
 def write_recording(path: Path, seconds: int) -> None:
@@ -110,18 +103,4 @@ def measure(asked: argparse.Namespace) -> Report:
     """Run the bench."""
     with tempfile.TemporaryDirectory(prefix="v2v-recorded-") as folder:
         made = list(turns(asked, Path(folder)))
-    records: list[dict[str, Any]] = [
-        {
-            "samples": name,
-            "cpu_seconds": min(turn[name] for turn in made),
-            "ratio": statistics.median(turn[name] / turn["dense store"] for turn in made),
-        }
-        for name in made[0]
-    ]
-    missed = [
-        text
-        for record in records
-        if record["samples"] == "recording"
-        for text in beyond(record["samples"], record, most={"ratio": MOST_TIMES})
-    ]
-    return Report(records, [(records, _COLUMNS)], [], missed)
+    return beside(made, "dense store", {"recording": MOST_TIMES})
