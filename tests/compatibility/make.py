@@ -4,9 +4,11 @@
 
     numerics-N   a folder of videos with its index, store and cache; a recipe, a state, a checkpoint
     planes-N-A   the same of videos with colour, deep light, motion, scenes and labels
+    recordings-M-N   a folder of prepared recordings
 
-A fixture is made once for each ``NUMERICS_VERSION`` N, and one of planes for each ``ANALYSIS_VERSION`` A, with the
-release that first has it, and is never rewritten.
+A fixture is made once for each ``NUMERICS_VERSION`` N, one of planes for each ``ANALYSIS_VERSION`` A, and one of
+recordings for each form M of their file (the last byte of ``FILE_MAGIC``), with the release that first has it, and is
+never rewritten.
 ``test_compatibility.py`` reads all of them.
 """
 
@@ -28,21 +30,24 @@ import torch
 import yaml
 
 from tests.clips import panned_luma, write_clip
-from tests.digests.clips import boxes_text, panning, write_coloured, write_deep, zooming
+from tests.digests.clips import boxes_text, panning, write_coloured, write_deep, write_recordings, zooming
+from tests.digests.rows import PORTABLE, SIZE, Row, digest, made, samples_of
 from tests.digests.rows import ROWS as PLANE_ROWS
-from tests.digests.rows import SIZE, Row, digest, made, samples_of
 from trainer.run.checkpoint import load_checkpoint
 from v2v_client import Batch, V2VStreamDataset
 from v2v_client.local_server import LocalServer
 from v2v_protocol import NUMERICS_VERSION, __version__
+from v2v_recordings.block_file import FILE_MAGIC
 from v2v_server.corpus.catalogue import Catalogue, index_path, open_catalogue
 from v2v_server.corpus.scenes.scene import ANALYSIS_VERSION
+from v2v_server.kinds.registry import KINDS
 from v2v_server.prepare import prepare
 from v2v_server.store.cache import Cache, make_cache
 from v2v_server.video.rows import Rows
 
 FOLDER = Path(__file__).parent / f"numerics-{NUMERICS_VERSION}"
 PLANES = Path(__file__).parent / f"planes-{NUMERICS_VERSION}-{ANALYSIS_VERSION}"
+RECORDINGS = Path(__file__).parent / f"recordings-{FILE_MAGIC[-1:].decode()}-{NUMERICS_VERSION}"
 RECIPE_FIELDS = {
     "preset": "paper", "voxels_per_clip": 2, "crop_height_px": 24, "crop_width_px": 24, "noise_sigma": [0.0, 0.05],
 }  # fmt: skip
@@ -54,9 +59,10 @@ CUT = 1
 
 def main() -> int:
     """Write the fixtures of this release that are missing, and refuse to replace one."""
-    missing = [(folder, make) for folder, make in ((FOLDER, _make), (PLANES, _make_planes)) if not folder.exists()]
+    makers = (FOLDER, _make), (PLANES, _make_planes), (RECORDINGS, _make_recordings)
+    missing = [(folder, make) for folder, make in makers if not folder.exists()]
     if not missing:
-        print(f"{FOLDER} and {PLANES.name} exist: a fixture is never rewritten", file=sys.stderr)
+        print(f"{FOLDER}, {PLANES.name} and {RECORDINGS.name} exist: a fixture is never rewritten", file=sys.stderr)
         return 2
     for folder, make in missing:
         with tempfile.TemporaryDirectory() as scratch:
@@ -188,6 +194,27 @@ def _make_planes(scratch: Path) -> Path:
         batches = labelled(server.address)
     (fixture / "state.json").write_text(json.dumps(batches[0].resume_state, indent=1, sort_keys=True))
     expected["labelled"] = [digest(batch.arrays[name].numpy()) for batch in batches for name in batch.arrays]
+    (fixture / "expected.json").write_text(json.dumps(expected, indent=1))
+    return fixture
+
+
+def recording_digests(folder: Path, cache_dir: Path) -> dict[str, Any]:
+    """Return the digest of a folder of prepared recordings, and of each array of each row of the table of digests."""
+    kind = KINDS["recordings"]
+    with closing(open_catalogue(folder, cache_dir=cache_dir, kind=kind, processes=0)) as catalogue:
+        rows = {name: row for name, row in PORTABLE.items() if row.kind == kind.name}
+        streams = {
+            name: {array: digest(values) for array, values in made(samples_of(catalogue, row))[0].items()}
+            for name, row in rows.items()
+        }
+        return {"catalogue_digest": catalogue.digest, "streams": streams}
+
+
+def _make_recordings(scratch: Path) -> Path:
+    fixture = scratch / "fixture"
+    fixture.mkdir()
+    found = recording_digests(write_recordings(fixture / "recordings"), scratch)
+    expected = {"release": __version__, "numerics_version": NUMERICS_VERSION, **found}
     (fixture / "expected.json").write_text(json.dumps(expected, indent=1))
     return fixture
 
