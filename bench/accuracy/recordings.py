@@ -9,7 +9,8 @@
 Each scene of ``tests/oracles/rendered.py``, at the given speeds, and the liveliest part of each film of high frame rate
 is seen by a camera of its own, event by event with exact times: thresholds from 0.15 to 0.4 that differ by pixel, a
 low-pass, a refractory period, noise events. No sample of the stream is made this way. A picture every 20 ms is the
-truth; the first 100 ms, in which a network has seen little, have none.
+truth; the first 100 ms, in which a network has seen little, have none. The scene of a photograph that `firenet-cpu`
+trains on is left out.
 
 With networks, it applies the rule of the model card (``bench/accuracy/rule.py``) to those of `--weights` and
 `--ema-weights`, on windows of a quarter of an event a pixel and on samples of `--photographs`. Those of
@@ -19,6 +20,7 @@ With networks, it applies the rule of the model card (``bench/accuracy/rule.py``
 from __future__ import annotations
 
 import argparse
+import csv
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -32,6 +34,7 @@ from tests.oracles.decoded import decode_luma
 from tests.oracles.dense import dense_events
 from tests.oracles.rendered import GAMMA, NAMES, Reals, rendered_scene
 from trainer.evaluation.metrics import make_metrics
+from trainer.run.data import LISTS
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
 from v2v_recordings.items import EventChunk, Picture
@@ -147,7 +150,11 @@ def judged(asked: argparse.Namespace) -> Report:
 def measure(asked: argparse.Namespace) -> Report:
     """Write the recordings; return one record for each, and what :func:`judged` returns."""
     records: list[dict[str, Any]] = []
+    rows = csv.DictReader((LISTS / "firenet-cpu.csv").read_text().splitlines())
+    trained_on = {Path(row["file"]).stem for row in rows if row["set"] == "training"}
     for number, (name, light, hz) in enumerate(scenes(asked.side, asked.video)):
+        if name.partition("_")[0] in trained_on:
+            continue
         events, drawn = seen(light, hz, np.random.default_rng((asked.seed, number)))
         with RecordingWriter(asked.out / f"{name}.h5", source=name) as writer:
             writer.add(events)

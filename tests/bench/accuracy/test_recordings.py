@@ -44,19 +44,24 @@ def test_a_step_of_light_fires_its_sign_at_its_time_and_nothing_else_but_noise(
 
 
 def written(folder: Path, monkeypatch: pytest.MonkeyPatch, *flags: str) -> Report:
-    """Write recordings to a folder, one of them too short for a picture, one with many events; return the report."""
+    """Write recordings to a folder, one of them too short for a picture, one with many events, one of a picture that
+    ``firenet-cpu`` trains on; return the report.
+    """
 
     def scenes(side: int, films: list[Path]) -> Iterator[tuple[str, recordings.Reals, float]]:
         yield "step", light(0.2, 0.8), HZ
         yield "flash", light(0.2, 0.8)[7:13], HZ
         yield "busy", np.random.default_rng(0).random((21, 16, 24)), HZ
+        yield "gravel_60", light(0.2, 0.8), HZ
 
     monkeypatch.setattr(recordings, "scenes", scenes)
     parser = parser_of("recordings", recordings)
     return recordings.measure(parser.parse_args(["--out", str(folder), "--side", "32", *flags]))
 
 
-def test_every_recording_has_true_pictures_at_their_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_recording_has_true_pictures_at_their_times_and_none_shows_one_of_the_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert [record["recording"] for record in written(tmp_path, monkeypatch).records] == ["step", "flash", "busy"]
     with Recording(tmp_path / "step.h5") as found:
         assert len(found.images) == 5
