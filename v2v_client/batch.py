@@ -334,8 +334,7 @@ def draw_samples(
     """
     camera, sheet = _drawing("camera"), _drawing("sheet")
     cameras = [camera.Camera.of(arrays, provenance, "", recipe) for arrays, provenance in samples]
-    drawn: npt.NDArray[np.uint8] = sheet.draw_sheet(cameras, title)
-    return drawn
+    return sheet.draw_sheet(cameras, title)
 
 
 def _drawing(name: str) -> Any:

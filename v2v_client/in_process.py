@@ -151,8 +151,7 @@ class V2VDataset(Fixed, Dataset[Sample]):
             IndexError, SampleUnavailable: as for ``dataset[index]``.
             VideoError: the video's frame rate is unknown.
         """
-        events: EventList = self._open().events(self.seed, self.epoch, self._place(index))
-        return events
+        return self._open().events(self.seed, self.epoch, self._place(index))
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch, which selects other cameras and another order. Call it before a DataLoader starts workers.
