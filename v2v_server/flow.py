@@ -85,8 +85,7 @@ def dis(preset: int, finest_scale: int, refinements: int | None = None) -> Estim
     def estimate(first: GreyPicture, second: GreyPicture) -> Field:
         # A small picture makes OpenCV lower the finest scale, also for the pictures that follow.
         search.setFinestScale(finest_scale)
-        field: Field = search.calc(first, second, None)  # type: ignore[call-overload]
-        return field
+        return search.calc(first, second, None)  # type: ignore[call-overload]
 
     return guarded(estimate, _SMALLEST_SIDE_PX)
 
@@ -292,8 +291,7 @@ def consistent(field: Field, opposite: Field) -> npt.NDArray[np.bool_]:
     back = cv2.remap(opposite, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     gap = ((field + back) ** 2).sum(axis=-1)
     length = (field**2).sum(axis=-1) + (back**2).sum(axis=-1)
-    agree: npt.NDArray[np.bool_] = inside & (gap < _CONSISTENT_SHARE * length + _CONSISTENT_PX2)
-    return agree
+    return inside & (gap < _CONSISTENT_SHARE * length + _CONSISTENT_PX2)
 
 
 class _Pictures:

@@ -205,8 +205,7 @@ class DecodedFrame(NamedTuple):
         part = np.empty((1, *stored[2:]), signal.dtype)
         copy_luma(self.samples, self.luma, stored, part[0], signal)
         stretch(part, self.luma)
-        upright: npt.NDArray[Any] = self.orientation.upright(part)[0]
-        return upright
+        return self.orientation.upright(part)[0]
 
     def picture(self, window: PixelRect, chroma: ChromaCut | None) -> DecodedPicture:
         """Return a window of the picture, with the colour of a cut."""
