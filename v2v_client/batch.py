@@ -334,7 +334,8 @@ def draw_samples(
     """
     camera, sheet = _drawing("camera"), _drawing("sheet")
     cameras = [camera.Camera.of(arrays, provenance, "", recipe) for arrays, provenance in samples]
-    return sheet.draw_sheet(cameras, title)
+    drawn: npt.NDArray[np.uint8] = sheet.draw_sheet(cameras, title)
+    return drawn
 
 
 def _drawing(name: str) -> Any:

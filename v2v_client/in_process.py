@@ -151,7 +151,8 @@ class V2VDataset(Fixed, Dataset[Sample]):
             IndexError, SampleUnavailable: as for ``dataset[index]``.
             VideoError: the video's frame rate is unknown.
         """
-        return self._open().events(self.seed, self.epoch, self._place(index))
+        events: EventList = self._open().events(self.seed, self.epoch, self._place(index))
+        return events
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch, which selects other cameras and another order. Call it before a DataLoader starts workers.

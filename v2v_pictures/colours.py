@@ -99,7 +99,8 @@ def draw_flow(flow: npt.NDArray[np.generic], largest_px: float | None = None) ->
     part = (at - np.floor(at))[..., None]
     hue = (1 - part) * _WHEEL[below] + part * _WHEEL[(below + 1) % len(_WHEEL)]
     colour = np.where(share <= 1.0, 255.0 - share * (255.0 - hue), _BEYOND * hue)
-    return np.rint(colour).astype(np.uint8)
+    image: Image = np.rint(colour).astype(np.uint8)
+    return image
 
 
 def draw_wheel(radius_px: int) -> Image:

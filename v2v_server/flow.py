@@ -85,7 +85,8 @@ def dis(preset: int, finest_scale: int, refinements: int | None = None) -> Estim
     def estimate(first: GreyPicture, second: GreyPicture) -> Field:
         # A small picture makes OpenCV lower the finest scale, also for the pictures that follow.
         search.setFinestScale(finest_scale)
-        return search.calc(first, second, None)  # type: ignore[call-overload]
+        field: Field = search.calc(first, second, None)  # type: ignore[call-overload]
+        return field
 
     return guarded(estimate, _SMALLEST_SIDE_PX)
 
@@ -291,7 +292,8 @@ def consistent(field: Field, opposite: Field) -> npt.NDArray[np.bool_]:
     back = cv2.remap(opposite, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     gap = ((field + back) ** 2).sum(axis=-1)
     length = (field**2).sum(axis=-1) + (back**2).sum(axis=-1)
-    return inside & (gap < _CONSISTENT_SHARE * length + _CONSISTENT_PX2)
+    agree: npt.NDArray[np.bool_] = inside & (gap < _CONSISTENT_SHARE * length + _CONSISTENT_PX2)
+    return agree
 
 
 class _Pictures:

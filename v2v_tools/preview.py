@@ -260,7 +260,8 @@ def _whole_picture(catalogue: Catalogue, provenance: Provenance, recipe: Recipe)
     with catalogue.source.open_pixels(provenance.video, provenance.fingerprint) as pixels:
         pixels.check(provenance.fingerprint)
         (clip,) = pixels.clips(ClipRequest(index, provenance.start_frame, (cut,), most_bits=most_bits))
-    return tone_table(recipe.gamma, clip.signal)[clip.frames[0]]
+    picture: npt.NDArray[np.uint8] = tone_table(recipe.gamma, clip.signal)[clip.frames[0]]
+    return picture
 
 
 def _fitted_stream(catalogue: Catalogue, spec: Mapping[str, Any], recipe: Any) -> StreamSpec:

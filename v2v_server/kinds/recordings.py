@@ -69,7 +69,10 @@ class RecordingKind(VideosKind):
 
     def open_pixels(self, path: Path) -> AbstractContextManager[Pixels]:
         """Lend the recording, with these marks."""
-        return import_module("v2v_server.store.recording").RecordedPixels(path, self.marks, self.rate)
+        found: AbstractContextManager[Pixels] = import_module("v2v_server.store.recording").RecordedPixels(
+            path, self.marks, self.rate
+        )
+        return found
 
     def with_flags(self, facts: VideoFacts, rate: float) -> VideoFacts:
         """Name the marks.

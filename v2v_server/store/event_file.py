@@ -113,7 +113,8 @@ class EventFile(AbstractContextManager["EventFile"]):
     def _times_of_block(self, number: int) -> npt.NDArray[np.int64]:
         rows, record = self._rows(number)[:4].astype(np.int64), self.blocks[number]
         steps = rows[0] + (rows[1] << 8) + (rows[2] << 16) + (rows[3] << 24)
-        return record["t_ns"] + record["unit_ns"] * np.cumsum(steps)
+        times: npt.NDArray[np.int64] = record["t_ns"] + record["unit_ns"] * np.cumsum(steps)
+        return times
 
     def _rows(self, number: int) -> npt.NDArray[np.uint8]:
         """Return a block, [8, n]."""

@@ -205,7 +205,8 @@ class DecodedFrame(NamedTuple):
         part = np.empty((1, *stored[2:]), signal.dtype)
         copy_luma(self.samples, self.luma, stored, part[0], signal)
         stretch(part, self.luma)
-        return self.orientation.upright(part)[0]
+        upright: npt.NDArray[Any] = self.orientation.upright(part)[0]
+        return upright
 
     def picture(self, window: PixelRect, chroma: ChromaCut | None) -> DecodedPicture:
         """Return a window of the picture, with the colour of a cut."""

@@ -227,7 +227,8 @@ def _leaves(pair: FrameArray, camera: Doubles, where: Doubles, way: Doubles) -> 
         _by_cell(cv2.dilate(_mismatch(pair, each), _BLOCK), way) > _NOISE_GREY for each in (camera, np.eye(2, 3))
     )
     # A block rests also where none was found; then it changes.
-    return apart & unexplained & (way.any(axis=-1) | ~changes)
+    leaves: _Mask = apart & unexplained & (way.any(axis=-1) | ~changes)
+    return leaves
 
 
 def _filled(goes: _Mask, has_texture: _Mask) -> _Mask:

@@ -63,7 +63,8 @@ def detail_of(levels: npt.NDArray[np.uint16], grey: npt.NDArray[np.uint8], signa
 
 def levels_of(grey: npt.NDArray[np.uint8], detail: npt.NDArray[np.int8], signal: Signal) -> npt.NDArray[np.uint16]:
     """Return the levels of grey and detail, [n, h, w] both, within the signal's limits whatever a file holds."""
-    return np.clip(_nearest(signal)[grey] + detail, 0, signal.white).astype(np.uint16)
+    levels: npt.NDArray[np.uint16] = np.clip(_nearest(signal)[grey] + detail, 0, signal.white).astype(np.uint16)
+    return levels
 
 
 def _nearest(signal: Signal) -> npt.NDArray[np.int16]:
