@@ -25,7 +25,7 @@ from v2v_client.mixture import MixtureConsumer, read_weights
 from v2v_client.options import Fixed, Labels, Options, Patience, check_labels, require_arguments, require_labels
 from v2v_client.passes import Iteration, Position
 from v2v_client.position import Consumer, EpochPlan, ResumeState, StreamIdentity
-from v2v_protocol.errors import RepeatedSamplesWarning, StateMismatch, UsageError
+from v2v_protocol.errors import RepeatedSamplesWarning, StateMismatch, UsageError, undo_on_error
 from v2v_protocol.keys import addresses, leaves_host
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import LARGEST_EPOCH, LARGEST_INDEX, LARGEST_SEED, html_table
@@ -203,12 +203,9 @@ class V2VStreamDataset(Fixed, IterableDataset[Batch]):
         require_arguments(cls.local, options)
         resolved = StreamSpec.from_dict({"preset": options.get("preset"), "recipe": read_recipe(recipe)}).recipe
         server = LocalServer(videos, workers=workers, flags=server_flags(resolved, options, *flags)).__enter__()
-        try:
+        with undo_on_error(server.stop):
             # V2V_KEYS may name a key for other servers.
             dataset = cls(server.address, batch_size, arrays, resolved, seed=seed, labels=labels, keys="", **options)
-        except BaseException:
-            server.stop()
-            raise
         dataset._stop_server = weakref.finalize(dataset, server.stop)
         return dataset
 

@@ -16,7 +16,7 @@ from typing import IO, Any
 import psutil
 
 from v2v_client.options import require_videos
-from v2v_protocol.errors import ServerLost, UsageError
+from v2v_protocol.errors import ServerLost, UsageError, undo_on_error
 from v2v_protocol.programs import environment
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import StreamSpec
@@ -76,7 +76,7 @@ class LocalServer:
             command = [sys.executable, "-m", "v2v_server", *self._arguments, "--port-file", str(port_file)]
             # A killed process cannot stop its server, so the server watches its parent.
             command += ["--parent-pid", str(os.getpid())]
-            try:
+            with undo_on_error(self.stop):
                 self._process = subprocess.Popen(
                     command,
                     stdin=subprocess.DEVNULL,
@@ -85,9 +85,6 @@ class LocalServer:
                     env=environment(),
                 )
                 self.address = self._wait_for(port_file, self._process)
-            except BaseException:
-                self.stop()
-                raise
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -149,3 +149,10 @@ def label(page: Canvas, x: int, y: int, text: str, colour: Rgb = INK) -> None:
     """Write text on a ground of its own, so that the panel below does not hide it."""
     page.box(x, y, x + text_width(text) + 10, y + 24, PAPER)
     page.text(x + 5, y + 2, text, colour=colour)
+
+
+def fitted(picture: Image, width_px: float, height_px: float) -> tuple[int, int]:
+    """Return width and height of a picture, [H, W] or [H, W, 3], that is scaled to fit a size, at least 1 px."""
+    height, width = picture.shape[:2]
+    scale = min(width_px / width, height_px / height)
+    return max(1, round(width * scale)), max(1, round(height * scale))

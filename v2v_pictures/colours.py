@@ -50,16 +50,14 @@ def draw_events(counts: npt.NDArray[np.generic], full: float) -> Image:
     share = np.where(size > 0, _PALEST + (1 - _PALEST) * root, 0)[..., None]
     brighter, darker = np.array(BRIGHTER, np.float32), np.array(DARKER, np.float32)
     colour = np.where((np.asarray(counts) > 0)[..., None], brighter, darker)
-    image: Image = np.rint(255.0 + share * (colour - 255.0)).astype(np.uint8)
-    return image
+    return np.rint(255.0 + share * (colour - 255.0)).astype(np.uint8)
 
 
 def draw_grey(picture: npt.NDArray[np.generic]) -> Image:
     """Draw [H, W] uint8, or floating point in 0 .. 1 (clipped), as RGB [H, W, 3]."""
     if picture.dtype != np.uint8:
         picture = np.rint(np.clip(picture.astype(np.float32), 0, 1) * 255).astype(np.uint8)
-    image: Image = np.repeat(picture.astype(np.uint8)[..., None], 3, axis=-1)
-    return image
+    return np.repeat(picture.astype(np.uint8)[..., None], 3, axis=-1)
 
 
 _STEPS = (
@@ -71,13 +69,12 @@ _CORNERS = {
     "cyan": (0, 255, 255), "blue": (0, 0, 255), "magenta": (255, 0, 255),
 }  # fmt: skip
 """More steps stand where the eye tells more hues apart."""
+_WHEEL = np.concatenate(
+    [np.linspace(_CORNERS[start], _CORNERS[end], steps, endpoint=False) for start, end, steps in _STEPS]
+)
+"""Hues of the directions, [N, 3] RGB."""
 _BEYOND = 0.75
 """Flow longer than the largest is shown darker by this."""
-
-
-def _wheel() -> npt.NDArray[np.float64]:
-    parts = [np.linspace(_CORNERS[start], _CORNERS[end], steps, endpoint=False) for start, end, steps in _STEPS]
-    return np.concatenate(parts)
 
 
 def draw_flow(flow: npt.NDArray[np.generic], largest_px: float | None = None) -> Image:
@@ -97,11 +94,10 @@ def draw_flow(flow: npt.NDArray[np.generic], largest_px: float | None = None) ->
     length = np.hypot(x, y)
     full = max(1.0, float(length.max(initial=0.0))) if largest_px is None else largest_px
     share = (length / full)[..., None]
-    wheel = _wheel()
-    at = (np.arctan2(y, x) / (2 * math.pi) % 1.0) * len(wheel)
-    below = at.astype(int) % len(wheel)
+    at = (np.arctan2(y, x) / (2 * math.pi) % 1.0) * len(_WHEEL)
+    below = at.astype(int) % len(_WHEEL)
     part = (at - np.floor(at))[..., None]
-    hue = (1 - part) * wheel[below] + part * wheel[(below + 1) % len(wheel)]
+    hue = (1 - part) * _WHEEL[below] + part * _WHEEL[(below + 1) % len(_WHEEL)]
     colour = np.where(share <= 1.0, 255.0 - share * (255.0 - hue), _BEYOND * hue)
     image: Image = np.rint(colour).astype(np.uint8)
     return image

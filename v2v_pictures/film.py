@@ -50,9 +50,7 @@ def draw_film(
 
 def _whole_size(whole: Camera, page_px: int, tile_px: int) -> tuple[int, int]:
     """Width and height of a panel of the whole picture, px: two beside each other."""
-    height, width = whole.frames.shape[1:]
-    scale = min((page_px - 2 * PAGE_MARGIN_PX - GAP_PX) / 2 / width, 1.25 * tile_px / height)
-    return max(1, round(width * scale)), max(1, round(height * scale))
+    return canvas.fitted(whole.frames[0], (page_px - 2 * PAGE_MARGIN_PX - GAP_PX) / 2, 1.25 * tile_px)
 
 
 def _draw_whole(page: Canvas, whole: Camera, number: int, scale: Scale, tile_px: int) -> None:

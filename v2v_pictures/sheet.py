@@ -131,8 +131,7 @@ def tint(image: Image, mask: npt.NDArray[np.uint8]) -> Image:
         if category not in _NO_OBJECT:
             place = mask == category
             tinted[place] += _TINT * (np.array(class_colour(int(category)), np.float32) - tinted[place])
-    result: Image = np.rint(tinted).astype(np.uint8)
-    return result
+    return np.rint(tinted).astype(np.uint8)
 
 
 def labelled_panel(
@@ -238,9 +237,7 @@ def draw_overview(
 
 def _panel(whole: Camera, tile_px: int) -> tuple[int, int]:
     """Return width and height of a panel, px."""
-    height, width = whole.frames.shape[1:]
-    scale = min((2 * tile_px + GAP_PX) / width, _HIGHEST_TILES * tile_px / height)
-    return max(1, round(width * scale)), max(1, round(height * scale))
+    return canvas.fitted(whole.frames[0], 2 * tile_px + GAP_PX, _HIGHEST_TILES * tile_px)
 
 
 def _same_clip(whole: Camera, camera: Camera) -> bool:
@@ -253,9 +250,7 @@ def whole_panel(page: Canvas, camera: Camera, x: int, y: int, width_px: int, hei
     """Draw the video's picture, small, and a box around what the camera sees of it."""
     if camera.whole is None:
         return
-    height, width = camera.whole.shape
-    scale = min(width_px / width, height_px / height)
-    size = max(1, round(width * scale)), max(1, round(height * scale))
+    size = canvas.fitted(camera.whole, width_px, height_px)
     page.panel(x, y, draw_grey(camera.whole), *size)
     _box(page, camera, x, y, *size)
 

@@ -30,6 +30,8 @@ A message states what is wrong with the value, the limit, and what to do, in thi
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 
 class RepeatedSamplesWarning(UserWarning):
@@ -185,3 +187,30 @@ class NoWorkers(ServerLost):
 
 class WorkerCrashLoop(V2VError):
     """Server workers died again and again without finishing a single sample."""
+
+
+@contextmanager
+def system_errors(kind: Callable[[str], V2VError], what: str) -> Iterator[None]:
+    """Turn an error of the system into one of this kind, until the end of the context.
+
+    Args:
+        kind: makes an error of its text.
+        what: what failed; the system's reason follows.
+
+    Raises:
+        V2VError: of this kind.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"{what}: {error.strerror or error}") from error
+
+
+@contextmanager
+def undo_on_error(undo: Callable[[], object]) -> Iterator[None]:
+    """Call a function if an error of any kind ends the context."""
+    try:
+        yield
+    except BaseException:
+        undo()
+        raise

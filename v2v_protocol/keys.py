@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
-from v2v_protocol.errors import KeyRefused, ProtocolError, UsageError
+from v2v_protocol.errors import KeyRefused, ProtocolError, UsageError, system_errors
 from v2v_protocol.persisted import Persisted, parse_json
 
 SIDES = ("consumer", "worker")
@@ -92,16 +92,11 @@ def read_private(file: Path) -> str:
     Raises:
         KeyRefused: it cannot be read, or other users can read it.
     """
-    try:
-        with file.open("rb") as opened:
-            mode = stat.S_IMODE(os.fstat(opened.fileno()).st_mode)
-            if mode & 0o077:
-                raise KeyRefused(
-                    f"key file {file} has mode {mode:04o}, so other users may have read it: chmod 600 {file}"
-                )
-            return opened.read(4096).decode(errors="replace")
-    except OSError as error:
-        raise KeyRefused(f"key file {file} cannot be read: {error.strerror}") from error
+    with system_errors(KeyRefused, f"key file {file} cannot be read"), file.open("rb") as opened:
+        mode = stat.S_IMODE(os.fstat(opened.fileno()).st_mode)
+        if mode & 0o077:
+            raise KeyRefused(f"key file {file} has mode {mode:04o}, so other users may have read it: chmod 600 {file}")
+        return opened.read(4096).decode(errors="replace")
 
 
 def write_key(file: Path, key: PeerKey) -> None:

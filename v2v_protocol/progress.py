@@ -8,8 +8,8 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager
 from functools import partial
-from types import TracebackType
 from typing import Any, TypeVar
 
 from v2v_protocol.programs import printable, show
@@ -21,7 +21,7 @@ _FIRST_SECONDS = 1.0
 _REFRESH_SECONDS = 0.1
 
 
-class Progress:
+class Progress(AbstractContextManager["Progress"]):
     """Show the progress of one task on standard error. Call it with the amount done; a context manager.
 
     Args:
@@ -52,12 +52,7 @@ class Progress:
         self._due = clock() + (LOG_SECONDS if self._bar is None else _FIRST_SECONDS)
         self._begun: tuple[float, float] | None = None  # (amount, time) from which the rate is measured
 
-    def __enter__(self) -> Progress:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

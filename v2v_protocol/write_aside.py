@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from v2v_protocol.errors import UsageError
+from v2v_protocol.errors import UsageError, system_errors
 
 _LISTS = frozenset({".txt", ".csv", ".lst"})
 """Endings of files that may name the videos beside them."""
@@ -75,11 +75,9 @@ def write_file(path: Path, content: bytes | str, flag: str = "") -> None:
     Raises:
         UsageError: it cannot be written.
     """
-    try:
-        with write_aside_and_rename(path) as partial:
-            partial.write_bytes(content.encode() if isinstance(content, str) else content)
-    except OSError as error:
-        raise UsageError(f"{flag} {path}: cannot be written: {error.strerror or error}".lstrip()) from error
+    named = f"{flag} {path}".lstrip()
+    with system_errors(UsageError, f"{named}: cannot be written"), write_aside_and_rename(path) as partial:
+        partial.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 def check_output(

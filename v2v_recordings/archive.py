@@ -28,7 +28,7 @@ unpacked at once, at most LARGEST_PIECE as well. Event data and pictures pack to
 """
 
 
-class Archive:
+class Archive(contextlib.AbstractContextManager["Archive"]):
     """Give access to the members of a zip file or folder by their paths, with / as separator.
 
     Any other file is its own only member. The ``._name`` files that macOS adds for each file, in zips and on other
@@ -62,10 +62,7 @@ class Archive:
             found = {entry.filename: entry.file_size for entry in self._zip.infolist() if not entry.is_dir()}
         self.bytes_of = {name: size for name, size in found.items() if not posixpath.basename(name).startswith("._")}
 
-    def __enter__(self) -> Archive:
-        return self
-
-    def __exit__(self, *_error: object) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._zip is not None:
             self._zip.close()
 

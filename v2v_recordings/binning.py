@@ -79,8 +79,7 @@ def positions(
         spans_events: whether these are the first and last event.
     """
     length_us = length_us + DELTA_US[kind] if spans_events else max(1.0, length_us)
-    found: npt.NDArray[np.float64] = np.clip(tau_us / length_us, 0.0, np.nextafter(1.0, 0.0))
-    return found
+    return np.clip(tau_us / length_us, 0.0, np.nextafter(1.0, 0.0))
 
 
 def bins_of(position: npt.NDArray[np.float64], bins: int) -> npt.NDArray[np.int64]:

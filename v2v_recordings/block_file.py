@@ -29,7 +29,7 @@ import zstandard
 
 from v2v_protocol.persisted import Limits, Persisted, to_plain
 from v2v_recordings.item_writer import ItemWriter, Written
-from v2v_recordings.items import EventChunk, FlowField, Picture
+from v2v_recordings.items import NO_EVENTS, EventChunk, FlowField, Picture
 
 MOST_BLOCK_EVENTS = 1 << 15
 LARGEST_SENSOR_SIDE_PX = 1 << 12
@@ -42,7 +42,6 @@ TABLE = np.dtype(
 )
 """Of pieces: when one begins, the number of its first event and the unit of its times; its first byte in the file, its
 size, and its hash."""
-NO_EVENTS = EventChunk(np.empty(0, np.int64), np.empty(0, np.uint16), np.empty(0, np.uint16), np.empty(0, bool))
 
 
 @dataclass(frozen=True, slots=True)

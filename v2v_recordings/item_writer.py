@@ -15,7 +15,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from v2v_protocol.errors import UsageError
+from v2v_protocol.errors import UsageError, system_errors
 from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_recordings.items import EventChunk, FlowField, Item, Light, Note, Picture, SensorSize
 
@@ -88,11 +88,9 @@ class ItemWriter(ABC):
         self._picture_size: SensorSize | None = None
         self._picture_times: list[int] = []
         self.written: Written | None = None
-        try:
+        with system_errors(UsageError, f"{path}: cannot be written"):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._open(self._files.enter_context(write_aside_and_rename(path, durable=True)))
-        except OSError as error:
-            raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
 
     @abstractmethod
     def _open(self, path: Path) -> None:

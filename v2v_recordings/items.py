@@ -61,6 +61,9 @@ class EventChunk:
         return EventChunk(self.t_ns[chosen], self.x[chosen], self.y[chosen], self.p[chosen])
 
 
+NO_EVENTS = EventChunk(np.empty(0, np.int64), np.empty(0, np.uint16), np.empty(0, np.uint16), np.empty(0, bool))
+
+
 @dataclass(frozen=True, eq=False)
 class Picture:
     """Hold a frame of the same sensor.

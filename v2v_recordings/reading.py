@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.errors import UsageError
+from v2v_protocol.errors import UsageError, system_errors
 from v2v_recordings import bag, dsec, faery_reader, hdf5, mvsec, npy_columns, prophesee, text_events
 from v2v_recordings.archive import starts_with
 from v2v_recordings.event_columns import TimeUnit, clock_fault
@@ -96,12 +96,10 @@ def recognise(path: Path) -> str:
     """
     if not path.exists():
         raise UsageError(f"no file or folder {path}")
-    try:
+    with system_errors(UsageError, f"{path} cannot be read"):
         for name, form in FORMS.items():
             if form.recognises(path):
                 return name
-    except OSError as error:
-        raise UsageError(f"{path} cannot be read: {error.strerror or error}") from error
     forms = "; ".join(form.title for form in FORMS.values())
     raise UsageError(f"{path} is not a known recording. Known forms: {forms}. v2v-convert takes one with --form")
 

@@ -14,7 +14,7 @@ import tempfile
 import zipfile
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, NamedTuple, Self
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -24,13 +24,12 @@ from v2v_protocol.events import EventList
 from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_recordings.archive import package
 from v2v_recordings.evt3 import Encoder, header_of
-from v2v_recordings.items import EventChunk, FlowField, Picture, SensorSize
+from v2v_recordings.items import NO_EVENTS, EventChunk, FlowField, Picture, SensorSize
 from v2v_recordings.late_signals import late_signals
 from v2v_recordings.limits import FORM_LIMITS, check_size, fits
 
 _NOTE = "simulated from video frames: log intensity is linear in time between frames"
 EVENTS_AT_ONCE = 1 << 16
-_NO_EVENTS = EventChunk(np.empty(0, np.int64), np.empty(0, np.uint16), np.empty(0, np.uint16), np.empty(0, bool))
 _Written = Generator[None, EventChunk | None, None]
 """A file that is being written: it is sent pieces of EVENTS_AT_ONCE events, the last of which may be shorter, and None
 at their end. To close it earlier removes its parts.
@@ -92,7 +91,7 @@ def write_events(path: Path, events: EventList) -> None:
         writer.add(events)
 
 
-class EventWriter:
+class EventWriter(contextlib.AbstractContextManager["EventWriter"]):
     """Write a recording inside a ``with`` block. A normal exit completes the file, an exception removes its parts.
 
     Attributes:
@@ -105,15 +104,12 @@ class EventWriter:
 
     def __init__(self, path: Path, form: str, size: tuple[int, int], planes: Sequence[str]) -> None:
         self._path, self._limit, self._size = path, EVENT_FORMS[form].limit, SensorSize(*size)
-        self._pending, self._last_us, self.events = _NO_EVENTS, 0, 0
+        self._pending, self._last_us, self.events = NO_EVENTS, 0, 0
         with contextlib.ExitStack() as files, self._words():
             self._planes = {name: _Planes(files.enter_context(_unnamed(path)), name, self._size) for name in planes}
             self._file = EVENT_FORMS[form].write(path, self._size, self._planes)
             next(self._file)
             self._files = files.pop_all()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         with self._files, self._words(), contextlib.suppress(StopIteration):
@@ -138,14 +134,11 @@ class EventWriter:
             if len(self._pending) == EVENTS_AT_ONCE:
                 with self._words():
                     self._file.send(self._pending)
-                self._pending = _NO_EVENTS
-
-    def add_picture(self, microseconds: int, picture: npt.NDArray[np.uint8]) -> None:
-        """Add a picture, uint8 [H, W], not earlier than the one before it. Its events may be added before or after."""
-        self.add_plane("images", microseconds, picture)
+                self._pending = NO_EVENTS
 
     def add_plane(self, kind: str, microseconds: int, plane: npt.NDArray[Any]) -> None:
         """Add a picture of a kind of PLANES: images and masks uint8 [H, W], flow [2, H, W] px until the next field.
+        It is not earlier than the one before it of its kind. Its events may be added before or after.
 
         Raises:
             UsageError: see :class:`EventWriter`.

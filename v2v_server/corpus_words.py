@@ -17,7 +17,7 @@ from v2v_protocol.recipe import LARGEST_SCALE, MOST_STEPS_PER_GRID, Recipe
 from v2v_protocol.sample import Refusal, RefusalKind
 from v2v_protocol.spec import StreamSpec
 from v2v_recordings.time_stamps import PLAUSIBLE_HZ
-from v2v_server.corpus.scenes.runs import Cleaning, Runs
+from v2v_server.corpus.scenes.runs import Runs
 from v2v_server.corpus.scenes.scene import MOST_ANALYSED_FRAMES, NO_BARS, Sides
 from v2v_server.corpus.sources.listing import format_problems
 from v2v_server.corpus.videos import SplitVideos, VideoEntry
@@ -144,7 +144,7 @@ def _unsuited_rate(video: VideoEntry, recipe: Recipe) -> Refusal | None:
 
 
 def _all_cut(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal:
-    recipe, runs = spec.recipe, Runs(SplitVideos.of([video.pieces or b""]), Cleaning.of(spec))
+    recipe, runs = spec.recipe, Runs(SplitVideos.of([video.pieces or b""]), spec)
     longest, needed = max(runs.frames.tolist(), default=0), int(recipe.sequence_at(video.frames_per_second)) + 1
     if longest < needed:
         most = longest_clip(longest, int(recipe.steps_at(video.frames_per_second)), recipe)

@@ -539,5 +539,4 @@ def view_mask(mask: npt.NDArray[Any], picture: Window, params: SampleParams, rec
 def _nearest(first: int, count: int, resized: int, size: int) -> npt.NDArray[np.int64]:
     """Return which of ``size`` pixels lies at the centre of each of ``count`` pixels of the resized picture."""
     # floor((place + 1/2) size / resized) in whole numbers.
-    places: npt.NDArray[np.int64] = (2 * np.arange(first, first + count, dtype=np.int64) + 1) * size // (2 * resized)
-    return places
+    return (2 * np.arange(first, first + count, dtype=np.int64) + 1) * size // (2 * resized)

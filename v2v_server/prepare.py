@@ -31,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 import xxhash
 
-from v2v_protocol.errors import CorpusError, UsageError, VideoError, VideoUnreadable
+from v2v_protocol.errors import CorpusError, UsageError, VideoError, VideoUnreadable, system_errors
 from v2v_protocol.persisted import Persisted
 from v2v_protocol.sample import Refusal
 from v2v_protocol.write_aside import is_writable, write_aside_and_rename
@@ -327,7 +327,7 @@ def check_destination(
         CorpusError: it is no folder, is write-protected, holds something else, overlaps with the source or lies in a
             prepared folder, or the disk is nearly full.
     """
-    try:
+    with system_errors(CorpusError, f"{target}: cannot be written to"):
         at = next(each for each in (target, *target.parents) if each.exists())
         if not at.is_dir():
             raise CorpusError(f"{target}: {at} is a file; give the name of a folder")
@@ -350,8 +350,6 @@ def check_destination(
                 f"{target}: holds {foreign[0]} ({len(foreign)} entries) and no manifest of v2v-prepare; choose an "
                 "empty or a new folder"
             )
-    except OSError as error:
-        raise CorpusError(f"{target}: cannot be written to: {error.strerror or error}") from error
 
 
 def check_free_space(folder: Path) -> None:

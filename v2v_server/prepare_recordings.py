@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from v2v_protocol.errors import CorpusError, UsageError, VideoError
+from v2v_protocol.errors import CorpusError, UsageError, VideoError, system_errors
 from v2v_protocol.persisted import Persisted
 from v2v_recordings.block_file import ENDING, EventFileWriter
 from v2v_recordings.items import ConvertOptions
@@ -84,11 +84,9 @@ def convert_recordings(source: Path, destination: Path, processes: int) -> Itera
             f"{source}: holds no recording of a known form; v2v-convert --help lists the forms, and converts what "
             "needs more flags to .h5, which is one"
         )
-    try:
+    with system_errors(CorpusError, f"{target}: cannot be written to"):
         for job in jobs:
             job.target.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise CorpusError(f"{target}: cannot be written to: {error.strerror or error}") from error
     for job, result in run_isolated(
         convert_recording, jobs, processes, lambda job: _LEAST_SECONDS + job.bytes / _BYTES_A_SECOND,
         MOST_MEMORY_BYTES, (target,),

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from v2v_protocol.command import Parser
-from v2v_protocol.errors import UsageError
+from v2v_protocol.errors import UsageError, system_errors
 from v2v_protocol.programs import show
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import asked_recipe, recipe_setting, spec_fields
@@ -60,10 +60,8 @@ def make_folder(out: Path) -> None:
     Raises:
         UsageError: it cannot be created.
     """
-    try:
+    with system_errors(UsageError, f"--out {out}: cannot be written"):
         make_output_folder(out)
-    except OSError as error:
-        raise UsageError(f"--out {out}: cannot be written: {error.strerror}") from error
 
 
 def asked_spec(asked: argparse.Namespace) -> StreamSpec:

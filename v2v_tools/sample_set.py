@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -104,7 +103,3 @@ def _write(path: Path, form: str, remade: RemadeSample, arrays: tuple[str, ...])
                 for at_us, plane in zip(ends_us[recipe.first_frame :], sample.arrays[name][:, 0], strict=True):
                     writer.add_plane(_PLANES[name], at_us, plane)
     return len(events)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -228,7 +228,7 @@ def make_recording(source: VideoSource, job: WholeVideo, advance: Callable[[int]
             if job.has_frames:
                 pictures = eight_bits(context.view, context.signal)
                 for number in range(first + (first > 0), last + 1):
-                    writer.add_picture(int(clip.since_us[number]), pictures[number - first])
+                    writer.add_plane("images", int(clip.since_us[number]), pictures[number - first])
             given = simulate(context, {}).given
             cuts = [shot for shot in job.shots if first < shot <= last]
             for begin, end in zip((first, *cuts), (*(cut - 1 for cut in cuts), last), strict=True):

@@ -214,11 +214,11 @@ def test_what_is_wrong_is_refused_in_words(tmp_path: Path) -> None:
         writer.add(some_events(9, 1))
         with pytest.raises(UsageError, match="step back behind"):
             writer.add(some_events(9, 1))
-        writer.add_picture(5, plane("images", 0))
+        writer.add_plane("images", 5, plane("images", 0))
         with pytest.raises(UsageError, match=r"images \[16, 24\] at 4 us; they must be \[16, 24\], in order of time"):
-            writer.add_picture(4, plane("images", 0))
+            writer.add_plane("images", 4, plane("images", 0))
         with pytest.raises(UsageError, match=r"images \[2, 3\] at 6 us; they must be \[16, 24\]"):
-            writer.add_picture(6, np.zeros((2, 3), np.uint8))
+            writer.add_plane("images", 6, np.zeros((2, 3), np.uint8))
         with pytest.raises(UsageError, match="flow were not announced"):
             writer.add_plane("flow", 6, plane("flow", 0))
     assert len(np.load(path)["t"]) == 9

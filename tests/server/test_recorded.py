@@ -17,8 +17,8 @@ from trainer.evaluation import voxelise
 from v2v_protocol.recipe import Recipe, preset
 from v2v_protocol.sample import SampleParams, array_layout, new_arrays
 from v2v_recordings.binning import NEVER, EventsOfCrop
-from v2v_recordings.block_file import NO_EVENTS, EventFileWriter
-from v2v_recordings.items import ConvertOptions, EventChunk
+from v2v_recordings.block_file import EventFileWriter
+from v2v_recordings.items import NO_EVENTS, ConvertOptions, EventChunk
 from v2v_recordings.reading import read_items
 from v2v_server.recorded import fill_arrays
 from v2v_server.simulation.draw import draw

@@ -43,7 +43,7 @@ from typing import Any, Protocol, TypeAlias
 import zmq
 from zmq.utils import z85
 
-from v2v_protocol.errors import UsageError
+from v2v_protocol.errors import UsageError, undo_on_error
 from v2v_protocol.keys import SIDES
 from v2v_protocol.messages import LARGEST_ARRAY_BYTES, LARGEST_REQUEST_BYTES, MOST_IN_FLIGHT_BYTES
 
@@ -558,7 +558,7 @@ class Sockets:
         self.waited_seconds = 0.0
         self.has_session: Callable[[bytes], bool] = lambda identity: False
         self._gate, self._poller = Gate(keys), zmq.Poller()
-        try:
+        with undo_on_error(self.close):
             is_private = worker_bind.startswith("ipc:")
             # The attribute is read at each call, because it is set later.
             asked = (lambda peer: self.has_session(peer)), admits
@@ -573,9 +573,6 @@ class Sockets:
             local = self._workers.bind(local_bind, "--worker-bind", admits_all=True) if has_local else ""
             self.worker_address = self._workers.bind(worker_bind, "--worker-bind")
             self.local_address = local or self.worker_address
-        except BaseException:
-            self.close()
-            raise
 
     def receive(self, seconds: float) -> list[ServerInput]:
         """Return at most one message of each side, the workers' first, so that neither side can starve the other.

@@ -75,12 +75,7 @@ def _run(arguments: argparse.Namespace) -> None:
     shard = None if arguments.shard is None else Shard.parse(arguments.shard)
     with Progress("probing videos") as shown:
         probed = _Probed(shown)
-        if shard is not None:
-            lines = _catalogue_shard(arguments, shard, probed)
-        else:
-            catalogue = _catalogue_all(arguments, probed)
-    if shard is None:
-        lines = _of_all(catalogue)
+        lines = _of_all(_catalogue_all(arguments, probed)) if shard is None else _of_shard(arguments, shard, probed)
     for line in [*lines, f"probed {counted(probed.files, 'file')} in {format_duration(time.monotonic() - begun)}"]:
         show(line)
 
@@ -115,7 +110,7 @@ def _catalogue_all(arguments: argparse.Namespace, probed: _Probed) -> Catalogue:
     )
 
 
-def _catalogue_shard(arguments: argparse.Namespace, shard: Shard, probed: _Probed) -> list[str]:
+def _of_shard(arguments: argparse.Namespace, shard: Shard, probed: _Probed) -> list[str]:
     """Catalogue a shard of a corpus, write its index to the parts, and return lines that say so.
 
     Progress is kept in this host's cache folder, so that a killed run continues.

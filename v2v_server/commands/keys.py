@@ -35,7 +35,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    path = Path(arguments.dir) if arguments.dir else _default_folder()
+    configuration = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
+    path = Path(arguments.dir or Path(configuration, "v2v", "keys"))
     folder = KeyFolder(path)
     if arguments.action in ("new", "revoke") and arguments.name is None:
         raise UsageError(f"{arguments.action} needs the name of a key, as in v2v-keys {arguments.action} gpu1")
@@ -56,10 +57,6 @@ def _run(arguments: argparse.Namespace) -> None:
                 show(f"{side:8}  {name:24}  {public}")
     else:
         show(f"revoked {arguments.name} ({', '.join(folder.revoke(arguments.name))})")
-
-
-def _default_folder() -> Path:
-    return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config", "v2v", "keys")
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, VideoChanged
+from v2v_protocol.errors import CorpusError, IndexUnreadable, UsageError, VideoChanged, undo_on_error
 from v2v_protocol.messages import Lease
 from v2v_protocol.sample import ARRAYS, Refusal, RefusalKind, sidecar_endings
 from v2v_protocol.spec import StreamSpec
@@ -103,7 +103,7 @@ class Corpus:
     source: VideoSource
     rows: Rows
     ids: tuple[str, ...]
-    refused: Mapping[str, str]
+    refused: dict[str, str]
     left_out: str = ""
 
 
@@ -213,7 +213,7 @@ def _refreshed(
     refused: dict[str, str],
 ) -> tuple[Store, VideoTable]:
     store = Store(path, notice)
-    try:
+    with undo_on_error(store.close):
         ids = sorted(list_members(source, store, ids, processes, notice, refused))
         kind = None if scenes is None else scenes.kind
         if kind is not None:
@@ -233,9 +233,6 @@ def _refreshed(
         if scenes is not None and scenes.collect(store, source, table, processes, progress, notice):
             table = _table(store, ids, kind)
         return store, table
-    except BaseException:
-        store.close()
-        raise
 
 
 def _table(store: Store, ids: list[str], kind: FigureKind | None) -> VideoTable:
@@ -596,9 +593,7 @@ def open_catalogue(
     corpus = list_corpus(opened, rows, notice)
     scenes = SceneCollection(corpus.rows) if scene else None
     path = index_path(opened.name, cache_dir)
-    refused = dict(corpus.refused)
-    store, table, notes = refresh_index(opened, corpus.ids, path, scenes, processes, progress, notice, refused)
-    corpus = replace(corpus, refused=refused)
+    store, table, notes = refresh_index(opened, corpus.ids, path, scenes, processes, progress, notice, corpus.refused)
     try:
         with without_collections():
             catalogue = _snapshot(corpus, table, notes, store, scenes, processes, notice)

@@ -24,7 +24,7 @@ from typing import Any
 
 import xxhash
 
-from v2v_protocol.errors import CorpusError, UsageError
+from v2v_protocol.errors import CorpusError, UsageError, system_errors, undo_on_error
 from v2v_protocol.write_aside import write_aside_and_rename
 from v2v_server.corpus.sources.listing import Notice, silent
 from v2v_server.corpus.videos import IndexRow
@@ -133,11 +133,8 @@ class Store:
             ":memory:" if path is None else path, timeout=_BUSY_SECONDS, isolation_level=None, check_same_thread=False
         )
         weakref.finalize(self, self._database.close)  # commands that end with their catalogue open
-        try:
+        with undo_on_error(self._database.close):
             self._prepare()
-        except BaseException:
-            self._database.close()
-            raise
 
     def _prepare(self) -> None:
         if self._version() == SCHEMA_VERSION:
@@ -287,7 +284,9 @@ class Store:
             self._patiently("BEGIN IMMEDIATE")
             with self._database:
                 for table, columns in ("video", IndexRow.__slots__), ("figures", _FIGURE_COLUMNS):
-                    if _has_table(other, table):
+                    if other.execute(
+                        "SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ?", (table,)
+                    ).fetchone():
                         rows = other.execute(f"SELECT {', '.join(columns)} FROM {table}")
                         self._database.executemany(_insert(table, columns), rows)
             return int(other.execute("SELECT COUNT(*) FROM video").fetchone()[0])
@@ -322,13 +321,6 @@ class Store:
     def close(self) -> None:
         """Close the file."""
         self._database.close()
-
-
-def _has_table(database: sqlite3.Connection, name: str) -> bool:
-    return (
-        database.execute("SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ?", (name,)).fetchone()
-        is not None
-    )
 
 
 def _blob(row: tuple[Any] | None) -> bytes | None:
@@ -380,12 +372,10 @@ def make_folder(folder: Path) -> None:
         CorpusError: it cannot.
     """
     probe = folder / f".part.{os.getpid()}"
-    try:
+    with system_errors(CorpusError, f"--out {folder}: cannot be written to"):
         folder.mkdir(parents=True, exist_ok=True)
         probe.touch()
         probe.unlink()
-    except OSError as error:
-        raise CorpusError(f"--out {folder}: cannot be written to: {error.strerror or error}") from error
 
 
 def write_part(index: Path, folder: Path, shard: Shard) -> Path:
@@ -395,11 +385,8 @@ def write_part(index: Path, folder: Path, shard: Shard) -> Path:
         CorpusError: it cannot be written.
     """
     path = folder / shard.file_name
-    try:
-        with write_aside_and_rename(path) as partial:
-            shutil.copyfile(index, partial)
-    except OSError as error:
-        raise CorpusError(f"{path}: cannot be written: {error.strerror or error}") from error
+    with system_errors(CorpusError, f"{path}: cannot be written"), write_aside_and_rename(path) as partial:
+        shutil.copyfile(index, partial)
     return path
 
 
@@ -409,10 +396,8 @@ def parts_in(folder: Path) -> list[Path]:
     Raises:
         CorpusError: there are none, some are missing, or they are of more than one division.
     """
-    try:
+    with system_errors(CorpusError, f"--merge {folder}: cannot be read"):
         names = sorted(os.listdir(folder))
-    except OSError as error:
-        raise CorpusError(f"--merge {folder}: cannot be read: {error.strerror or error}") from error
     found = {Shard(int(name[2]), int(name[1])): folder / name[0] for name in map(_NAME.fullmatch, names) if name}
     counts = {shard.count for shard in found}
     if not counts:

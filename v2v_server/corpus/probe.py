@@ -115,22 +115,21 @@ def facts_of(path: Path, kind: VideosKind = VIDEOS) -> VideoFacts:
         return pixels.facts()
 
 
-def _facts(path: Path, kind: VideosKind) -> VideoFacts:
+def _facts(path: Path, kind: VideosKind, is_last: bool = False) -> VideoFacts:
     """Return what is known of the video; retry once after an error of the system rather than of the decoder.
 
     Raises:
         VideoUnreadable: the system reported an error twice.
         VideoError: the file is not a supported video.
     """
-    for is_last in (False, True):
-        try:
-            return facts_of(path, kind)
-        except VideoError as error:
-            if not isinstance(error.__cause__, OSError):
-                raise
-            if is_last:
-                raise VideoUnreadable(error.video, error.frame, error.reason) from error
-    raise AssertionError("the last try returns or raises")
+    try:
+        return facts_of(path, kind)
+    except VideoError as error:
+        if not isinstance(error.__cause__, OSError):
+            raise
+        if is_last:
+            raise VideoUnreadable(error.video, error.frame, error.reason) from error
+    return _facts(path, kind, is_last=True)
 
 
 def probe_files(
@@ -498,12 +497,9 @@ def _read(
     try:
         for done, ((video, id, *_), result) in enumerate(isolated, 1):
             notice(f"read {id}, {done} of {len(jobs)} new or changed sidecars {ending}")
-            died = (
-                f"reading it took too much time or memory, or crashed ({result.how})"
-                if isinstance(result, Died)
-                else ""
-            )
-            *facts, table = ("", died, "", b"") if isinstance(result, Died) else result
+            if isinstance(result, Died):
+                result = "", f"reading it took too much time or memory, or crashed ({result.how})", "", b""
+            *facts, table = result
             if facts[0]:
                 text, mark = "\n".join((states[video], *facts)), facts[0].encode() + b"\n"
                 fresh.append(Figures(video, videos[video], text.encode(), mark + table))

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from types import TracebackType
+from contextlib import AbstractContextManager
 from typing import Any
 
-from v2v_protocol.errors import ProtocolError, RemoteError, ServerLost, UsageError
+from v2v_protocol.errors import ProtocolError, RemoteError, ServerLost, undo_on_error
 from v2v_protocol.link.dealer import Dealer
 from v2v_protocol.messages import Denied, GetStatus, Status, decode, encode
 from v2v_protocol.persisted import parse_json
@@ -15,7 +15,7 @@ _AGAIN_SECONDS = 2.0
 """An unanswered request is repeated after this time: it may be lost with a connection."""
 
 
-class StatusClient:
+class StatusClient(AbstractContextManager["StatusClient"]):
     """One connection to a server.
 
     Args:
@@ -31,18 +31,10 @@ class StatusClient:
     def __init__(self, address: str, keys: str | None = None, *, insecure: bool = False) -> None:
         self._address = address
         self._link = Dealer(address, keys, insecure=insecure)
-        try:
+        with undo_on_error(self.close):
             self._link.connect()
-        except UsageError:
-            self.close()
-            raise
 
-    def __enter__(self) -> StatusClient:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def get_status(self, timeout_seconds: float = 10.0) -> dict[str, Any]:

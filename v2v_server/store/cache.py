@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from v2v_protocol.errors import CorpusError, VideoError, VideoUnreadable
+from v2v_protocol.errors import CorpusError, VideoError, VideoUnreadable, system_errors
 from v2v_protocol.write_aside import make_output_folder
 from v2v_server.store.format import PIECE_FRAMES, QUICK
 from v2v_server.store.pixels import Pixels
@@ -282,8 +282,6 @@ def make_cache(folder: Path) -> None:
     Raises:
         CorpusError: the folder cannot be created, read or written.
     """
-    try:
+    with system_errors(CorpusError, f"--cache {folder}: cannot be written to"):
         make_output_folder(folder)
         QuotaFolder(folder, 0, _LOCK_SECONDS).make()
-    except OSError as error:
-        raise CorpusError(f"--cache {folder}: cannot be written to: {error.strerror or error}") from error

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from contextlib import AbstractContextManager
-from types import TracebackType
+from functools import partial
 from typing import Any
 
 import msgpack
@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import xxhash
 
-from v2v_protocol.errors import ProtocolError, UsageError, VideoError, VideoUnreadable
+from v2v_protocol.errors import ProtocolError, UsageError, VideoError, VideoUnreadable, system_errors, undo_on_error
 from v2v_recordings.binning import NEVER, EventsOfCrop
 from v2v_recordings.block_file import FILE_MAGIC, MOST_BLOCK_EVENTS, TABLE, TAIL, EventHead
 from v2v_server.store.format import Bytes, UnpackingError, unpack
@@ -42,15 +42,10 @@ class EventFile(AbstractContextManager["EventFile"]):
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._path = os.fspath(path)
-        try:
+        with system_errors(partial(VideoUnreadable, self._path, None), "cannot be read"):
             self._file = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # opening a FIFO must not block
-        except OSError as error:
-            raise VideoUnreadable(self._path, None, f"cannot be read: {error.strerror or error}") from error
-        try:
+        with undo_on_error(partial(os.close, self._file)):
             self._read_head()
-        except BaseException:
-            os.close(self._file)
-            raise
 
     def _read_head(self) -> None:
         self._size = os.fstat(self._file).st_size
@@ -149,10 +144,8 @@ class EventFile(AbstractContextManager["EventFile"]):
     def _pread(self, size: int, offset: int) -> bytes:
         if min(size, offset) < 0 or offset + size > self._size:
             raise self._damaged("it is shorter than it says")
-        try:
+        with system_errors(partial(VideoUnreadable, self._path, None), "cannot be read"):
             data = os.pread(self._file, size, offset)
-        except OSError as error:
-            raise VideoUnreadable(self._path, None, f"cannot be read: {error.strerror or error}") from error
         if len(data) != size:
             raise self._damaged("it is shorter than it says")
         return data
@@ -160,7 +153,5 @@ class EventFile(AbstractContextManager["EventFile"]):
     def _damaged(self, why: str) -> VideoError:
         return VideoError(self._path, None, f"is no intact prepared recording ({why}): {_REMEDY}")
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         os.close(self._file)

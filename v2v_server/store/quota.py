@@ -139,10 +139,10 @@ class QuotaFolder:
 
     def _evict(self, size: int) -> None:
         enough = max(0, int(self.most_bytes * _KEPT_SHARE) - size)
-        for oldest in _oldest_first(self.folder):
+        for _, oldest in sorted((entry.stat().st_mtime_ns, entry.path) for entry in _files(self.folder)):
             if self._bytes <= enough and self.free_bytes >= self.least_free_bytes:
                 return
-            self._bytes -= delete_unless_read(oldest)
+            self._bytes -= delete_unless_read(Path(oldest))
 
 
 def used_bytes(folder: Path) -> int:
@@ -178,10 +178,6 @@ def _files(folder: Path) -> Iterator[os.DirEntry[str]]:
         if below.is_dir() and below.name != PARTIAL:
             with os.scandir(below) as entries:
                 yield from entries
-
-
-def _oldest_first(folder: Path) -> list[Path]:
-    return [Path(path) for _, path in sorted((entry.stat().st_mtime_ns, entry.path) for entry in _files(folder))]
 
 
 def delete_unless_read(path: Path) -> int:

@@ -176,8 +176,3 @@ class RecordedPixels(EventFile):
             for name, array in out.items():
                 array[grid] = known[name] if grid >= view.spec.flow_from else 0
         return ""
-
-
-def open_pixels(path: Path) -> RecordedPixels:
-    """Open a prepared recording."""
-    return RecordedPixels(path)

@@ -10,16 +10,24 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import chain, islice
 from pathlib import Path
-from types import MappingProxyType, TracebackType
+from types import MappingProxyType
 from typing import Any, BinaryIO, NoReturn
 
 import numpy as np
 import numpy.typing as npt
 
-from v2v_protocol.errors import ProtocolError, UsageError, VideoChanged, VideoError, VideoUnreadable
+from v2v_protocol.errors import (
+    ProtocolError,
+    UsageError,
+    VideoChanged,
+    VideoError,
+    VideoUnreadable,
+    system_errors,
+    undo_on_error,
+)
 from v2v_server.store.format import (
     BLOCK_COLUMNS,
     BLOCK_ROWS,
@@ -68,10 +76,8 @@ class BlockReader:
 
     def __init__(self, path: str, file: int, offset: int = 0, *, is_sparse: bool = False) -> None:
         self._path, self._file, self._offset, self._is_sparse = path, file, offset, is_sparse
-        try:
+        with system_errors(partial(VideoUnreadable, path, None), "cannot be read"):
             self.head, self._table = read_head(path, file, offset)
-        except OSError as error:
-            raise VideoUnreadable(path, None, f"cannot be read: {error.strerror or error}") from error
 
     def read(self, start: int, stride: int, window: PixelRect, out: npt.NDArray[np.uint8]) -> bool:
         """Read frames start, start + stride ... of a window.
@@ -202,17 +208,12 @@ class StoreFile(BlockReader, AbstractContextManager["StoreFile"]):
 
     def __init__(self, path: str | os.PathLike[str], fingerprint: str = "") -> None:
         path = os.fspath(path)
-        try:
+        with system_errors(partial(VideoUnreadable, path, None), "cannot be read"):
             file = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # opening a FIFO must not block
-        except OSError as error:
-            raise VideoUnreadable(path, None, f"cannot be read: {error.strerror or error}") from error
-        try:
+        with undo_on_error(partial(os.close, file)):
             super().__init__(path, file)
             if fingerprint:
                 self.check(fingerprint)
-        except BaseException:
-            os.close(file)
-            raise
 
     def facts(self) -> VideoFacts:
         """Return the facts of the source.
@@ -284,9 +285,7 @@ class StoreFile(BlockReader, AbstractContextManager["StoreFile"]):
             for picture in grey:
                 yield DecodedPicture(picture, picture, SDR, self.head.codec, self.head.bit_exact)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         os.close(self._file)
 
     @cached_property
@@ -339,10 +338,8 @@ class StoreFile(BlockReader, AbstractContextManager["StoreFile"]):
 
     @cached_property
     def _places(self) -> Mapping[str, PlanePlace]:
-        try:
+        with system_errors(partial(VideoUnreadable, self._path, None), "cannot be read"):
             return read_footer(self._path, self._file)
-        except OSError as error:
-            raise VideoUnreadable(self._path, None, f"cannot be read: {error.strerror or error}") from error
 
 
 def read_clips(files: Sequence[StoreFile], request: ClipRequest, origin: str) -> tuple[DecodedClip, ...]:
@@ -554,9 +551,7 @@ class StoreWriter(AbstractContextManager["StoreWriter"]):
             shutil.copyfileobj(file, self._file)
         self._file.write(pack_footer(places))
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._files.close()
 
 

@@ -24,6 +24,7 @@ from pathlib import Path
 
 import psutil
 
+from v2v_protocol.errors import undo_on_error
 from v2v_protocol.keys import PeerKey, nameless_key
 from v2v_protocol.programs import environment
 from v2v_server.broker.leases import Cause, Loss
@@ -84,12 +85,8 @@ class WorkerProcess:
             OSError: it has ended.
         """
         assert self.process.stdin is not None
-        try:
-            with self.process.stdin as file:
-                file.write("\0".join(told).encode())
-        except OSError:
-            self.end()
-            raise
+        with undo_on_error(self.end), self.process.stdin as file:
+            file.write("\0".join(told).encode())
 
     def status(self, now: float = 0.0) -> ProcessStatus:
         """Observe it."""

@@ -29,7 +29,7 @@ from typing import Any, Generic, TypeVar, get_type_hints
 
 import msgpack
 
-from v2v_protocol.errors import UsageError, V2VError
+from v2v_protocol.errors import UsageError, V2VError, undo_on_error
 from v2v_protocol.persisted import reader, to_plain
 from v2v_server.system.process import die_with_parent, limit_memory, relayed_output
 from v2v_server.system.sandbox import confine
@@ -273,7 +273,7 @@ class _Lane(Generic[J, _R]):
         self._unsent = len(setup).to_bytes(_LENGTH_BYTES) + setup
         self.socket, other = socketpair()
         self.socket.settimeout(_SEND_SECONDS)
-        try:
+        with undo_on_error(self.socket.close), closing(other):
             self._process = subprocess.Popen(
                 [sys.executable, "-c", _PROGRAM, str(other.fileno()), *sys.path],
                 stdin=subprocess.DEVNULL,
@@ -282,11 +282,6 @@ class _Lane(Generic[J, _R]):
                 pass_fds=[other.fileno()],
                 start_new_session=True,  # no terminal sends it a signal; this process decides what follows a Ctrl-C
             )
-        except BaseException:
-            self.socket.close()
-            raise
-        finally:
-            other.close()
 
     def begin(self, job: J) -> None:
         self._job = job

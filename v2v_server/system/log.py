@@ -44,18 +44,16 @@ class Log:
     Args:
         is_json: one JSON object per line, with ``time`` (ISO 8601, UTC), ``level``, ``text``, and fields that describe
             the subject of the line.
-        wall_clock: returns the time.
 
     Attributes:
         before_line: called before each line; a display that is replaced in place clears itself.
         lock: held while text is written: lines come from several threads.
     """
 
-    def __init__(self, *, is_json: bool = False, wall_clock: Callable[[], str] | None = None) -> None:
+    def __init__(self, *, is_json: bool = False) -> None:
         self.is_json = is_json
         self.before_line: Callable[[], None] = lambda: None
         self.lock = threading.Lock()
-        self._wall_clock = wall_clock or _utc_now
 
     def say(self, text: str, level: Level = "info", **about: Any) -> None:
         """Write one line.
@@ -66,7 +64,10 @@ class Log:
             about: plain values for programs; left out of plain text, which states the same in words.
         """
         if self.is_json:
-            text = json.dumps({"time": self._wall_clock(), "level": level, "text": text, **about}, default=str)
+            text = json.dumps(
+                {"time": datetime.now(UTC).isoformat(timespec="milliseconds"), "level": level, "text": text, **about},
+                default=str,
+            )
         elif sys.stderr.isatty():
             text = f"{datetime.now():%H:%M:%S} {text}"
         with self.lock:
@@ -89,10 +90,6 @@ def report_errors(run: Callable[[Namespace], int | None]) -> Callable[[Namespace
             raise
 
     return run_and_report
-
-
-def _utc_now() -> str:
-    return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
 @dataclass(frozen=True, slots=True)

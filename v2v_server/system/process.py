@@ -19,13 +19,13 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from socket import SHUT_WR, socket, socketpair
 from threading import Thread
 
 from v2v_protocol import arena
-from v2v_protocol.errors import CorpusError
+from v2v_protocol.errors import CorpusError, undo_on_error
 from v2v_protocol.programs import printable
 
 _PR_SET_PDEATHSIG = 1
@@ -345,16 +345,13 @@ def open_private(path: Path, flags: int, mode: int = 0o600) -> int:
         OSError: the file cannot be opened, or is not a regular one.
     """
     descriptor = os.open(path, flags | os.O_CLOEXEC | os.O_NONBLOCK, mode)
-    try:
+    with undo_on_error(partial(os.close, descriptor)):
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
             raise OSError(errno.EINVAL, "not a regular file", str(path))
         is_open = stat.S_IMODE(status.st_mode) & ~mode
         if status.st_uid == os.geteuid() and is_open and not path.is_symlink():
             os.fchmod(descriptor, mode)
-    except BaseException:
-        os.close(descriptor)
-        raise
     return descriptor
 
 

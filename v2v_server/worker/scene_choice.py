@@ -273,8 +273,7 @@ def _touched(start_px: float, extent_px: int, side_px: float) -> npt.NDArray[np.
     first = min(TILES - 1, math.floor(start_px * TILES / side_px))
     end = max(first + 1, math.ceil((start_px + extent_px) * TILES / side_px))
     numbers = np.arange(TILES)
-    touched: npt.NDArray[np.bool_] = (numbers >= first) & (numbers < end)
-    return touched
+    return (numbers >= first) & (numbers < end)
 
 
 def _kind(methods: tuple[str, ...]) -> str:

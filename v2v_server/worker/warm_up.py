@@ -40,7 +40,7 @@ _LONGEST_WAIT_SECONDS = 300.0
 
 def warm_up_in_turn() -> None:
     """Load the kernels that every worker runs, after compiling them or waiting for another process that does."""
-    with one_compiles(*_place()) as is_to_compile:
+    with one_compiles(_mark()) as is_to_compile:
         if is_to_compile:
             _compile_apart()
         load_kernels()
@@ -48,7 +48,7 @@ def warm_up_in_turn() -> None:
 
 def load_in_turn(variant: Variant) -> None:
     """Load one variant of the kernels in the same way."""
-    with one_compiles(*_place(variant)) as is_to_compile:
+    with one_compiles(_mark(variant)) as is_to_compile:
         if is_to_compile:
             print(f"compiling the kernel for {variant}, once on this host", file=sys.stderr, flush=True)
             _compile_apart(json.dumps(variant))
@@ -57,8 +57,7 @@ def load_in_turn(variant: Variant) -> None:
 
 def is_compiled(variant: Variant) -> bool:
     """Return whether a variant is known to be compiled, so that loading it is quick."""
-    folder, key = _place(variant)
-    return _mark(folder, key).exists()
+    return _mark(variant).exists()
 
 
 def _load(variant: Variant) -> None:
@@ -91,13 +90,13 @@ def _without_scipy() -> Iterator[None]:
         del sys.modules["scipy.linalg"]
 
 
-def _place(variant: Variant | None = None) -> tuple[Path, str]:
-    """Return the folder of the compiled code, and a name for what is compiled."""
+def _mark(variant: Variant | None = None) -> Path:
+    """Return the file that says, beside the compiled code, that compiling it was completed."""
     kernel: Any = simulate_pixels
     # As Numba does, separate code compiled by other Pythons or for other processors.
     processor = kernel.targetctx.codegen().magic_tuple()
     key = repr((sources_digest(), sys.implementation.cache_tag, processor, *(variant or ())))
-    return Path(kernel.stats.cache_path), hashlib.sha256(key.encode()).hexdigest()[:12]
+    return Path(kernel.stats.cache_path, f"{hashlib.sha256(key.encode()).hexdigest()[:12]}.complete")
 
 
 def _compile_apart(*variant: str) -> None:
@@ -107,28 +106,22 @@ def _compile_apart(*variant: str) -> None:
         subprocess.run(command, stdin=subprocess.DEVNULL, check=False)
 
 
-def _mark(folder: Path, key: str) -> Path:
-    return folder / f"{key}.complete"
-
-
 @contextmanager
-def one_compiles(folder: Path, key: str, longest_wait_seconds: float = _LONGEST_WAIT_SECONDS) -> Iterator[bool]:
+def one_compiles(complete: Path, longest_wait_seconds: float = _LONGEST_WAIT_SECONDS) -> Iterator[bool]:
     """Let one process at a time run the body until one has completed it; later ones run it without a lock.
 
     Args:
-        folder: the cache.
-        key: name of what is compiled; each key has its own lock.
+        complete: the file that says that it is completed, in the folder of the cache; each has its own lock.
         longest_wait_seconds: longest wait for other processes.
 
     Yields:
         whether no process is known to have completed it.
     """
-    complete = _mark(folder, key)
     with ExitStack() as turn:
         if not complete.exists():
             # A folder of another user, a file system without locks, or a wait that is over: compile without one.
             with suppress(OSError):
-                turn.enter_context(locked(folder / f"{key}.lock", longest_wait_seconds))
+                turn.enter_context(locked(complete.with_suffix(".lock"), longest_wait_seconds))
         is_first = not complete.exists()
         if not is_first:
             turn.close()

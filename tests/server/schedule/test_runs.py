@@ -14,7 +14,7 @@ from tests.pieces import pieces, shots
 from v2v_protocol.errors import UsageError
 from v2v_protocol.recipe import Recipe
 from v2v_protocol.spec import DEFECTS, StreamSpec
-from v2v_server.corpus.scenes.runs import Cleaning, Runs
+from v2v_server.corpus.scenes.runs import Runs
 from v2v_server.corpus.scenes.scene import NO_BARS, Flag, Pieces, Sides
 from v2v_server.corpus.videos import SplitVideos, VideoEntry, encoded_pieces
 from v2v_server.schedule import SequenceTable
@@ -68,7 +68,7 @@ def divided(draw: st.DrawFn) -> Pieces:
 @given(st.lists(divided(), min_size=1, max_size=3), st.data())
 def test_flagged_frames_are_counted_one_by_one(all_parts: list[Pieces], data: st.DataObject) -> None:
     split = SplitVideos.of(encoded_pieces(parts, 300) for parts in all_parts)
-    runs = Runs(split, Cleaning.of(StreamSpec(scene="auto", keep_defects=",".join(DEFECTS))))
+    runs = Runs(split, StreamSpec(scene="auto", keep_defects=",".join(DEFECTS)))
     flags = np.repeat(split.pieces["flags"], split.pieces["end"] - split.firsts())
     assume(len(flags))
     first = data.draw(st.integers(0, len(flags) - 1))

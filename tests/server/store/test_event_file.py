@@ -20,8 +20,8 @@ from hypothesis import strategies as st
 from v2v_protocol.errors import UsageError, VideoError, VideoUnreadable
 from v2v_recordings import block_file, item_writer
 from v2v_recordings.binning import NEVER, EventsOfCrop
-from v2v_recordings.block_file import NO_EVENTS, TABLE, TAIL, EventFileWriter
-from v2v_recordings.items import EventChunk, FlowField, Light, Note, Picture, SensorSize
+from v2v_recordings.block_file import TABLE, TAIL, EventFileWriter
+from v2v_recordings.items import NO_EVENTS, EventChunk, FlowField, Light, Note, Picture, SensorSize
 from v2v_server.store import event_file
 from v2v_server.store.event_file import EventFile
 

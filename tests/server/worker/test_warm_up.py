@@ -35,11 +35,11 @@ def is_held(folder: Path) -> bool:
 
 
 def test_the_first_process_holds_the_lock_and_later_ones_need_none(tmp_path: Path) -> None:
-    with one_compiles(tmp_path, KEY) as is_first:
+    with one_compiles(tmp_path / f"{KEY}.complete") as is_first:
         assert is_first
         assert is_held(tmp_path)
     assert not is_held(tmp_path)
-    with one_compiles(tmp_path, KEY) as is_first:
+    with one_compiles(tmp_path / f"{KEY}.complete") as is_first:
         assert not is_first
         assert not is_held(tmp_path)
 
@@ -50,11 +50,11 @@ def test_the_second_waits_and_then_holds_nothing(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(time, "sleep", lambda seconds: waits.set())
 
     def second() -> None:
-        with one_compiles(tmp_path, KEY) as is_first:
+        with one_compiles(tmp_path / f"{KEY}.complete") as is_first:
             order.append((is_first, is_held(tmp_path)))
 
     thread = threading.Thread(target=second)
-    with one_compiles(tmp_path, KEY):
+    with one_compiles(tmp_path / f"{KEY}.complete"):
         thread.start()
         assert waits.wait(60.0)
         order.append("the first is done")
@@ -63,10 +63,10 @@ def test_the_second_waits_and_then_holds_nothing(monkeypatch: pytest.MonkeyPatch
 
 
 def test_one_that_fails_leaves_the_work_to_the_next(tmp_path: Path) -> None:
-    with pytest.raises(MemoryError), one_compiles(tmp_path, KEY):
+    with pytest.raises(MemoryError), one_compiles(tmp_path / f"{KEY}.complete"):
         raise MemoryError
     assert not is_held(tmp_path)
-    with one_compiles(tmp_path, KEY) as is_first:
+    with one_compiles(tmp_path / f"{KEY}.complete") as is_first:
         assert is_first
 
 
@@ -91,7 +91,10 @@ def test_a_confined_process_compiles_in_its_own_memory(tmp_path: Path) -> None:
 def test_a_process_that_is_stuck_or_compiles_for_another_processor_is_not_waited_for(
     tmp_path: Path, key: str, longest: float
 ) -> None:
-    with one_compiles(tmp_path, KEY), one_compiles(tmp_path, key, longest_wait_seconds=longest) as is_first:
+    with (
+        one_compiles(tmp_path / f"{KEY}.complete"),
+        one_compiles(tmp_path / f"{key}.complete", longest_wait_seconds=longest) as is_first,
+    ):
         assert is_first
 
 
@@ -100,14 +103,14 @@ def test_without_locks_all_compile_at_once(monkeypatch: pytest.MonkeyPatch, tmp_
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
     monkeypatch.setattr(fcntl, "flock", flock)
-    with one_compiles(tmp_path, KEY) as one, one_compiles(tmp_path, KEY) as other:
+    with one_compiles(tmp_path / f"{KEY}.complete") as one, one_compiles(tmp_path / f"{KEY}.complete") as other:
         assert one
         assert other
 
 
 def test_without_a_folder_all_compile_at_once(tmp_path: Path) -> None:
     absent = tmp_path / "absent"
-    with one_compiles(absent, KEY) as one, one_compiles(absent, KEY) as other:
+    with one_compiles(absent / f"{KEY}.complete") as one, one_compiles(absent / f"{KEY}.complete") as other:
         assert one
         assert other
     assert not absent.exists()

@@ -9,13 +9,12 @@ frame.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.spec import StreamSpec
-from v2v_server.corpus.scenes.scene import Flag, Pieces, Sides, sides_of
+from v2v_server.corpus.scenes.scene import Flag, Sides, sides_of
 from v2v_server.corpus.videos import SplitVideos
 
 _SKIPPED = {
@@ -28,30 +27,8 @@ _SKIPPED = {
 _Int64 = npt.NDArray[np.int64]
 
 
-@dataclass(frozen=True, slots=True)
-class Cleaning:
-    """What a spec does about the defects of videos.
-
-    Attributes:
-        skipped: bits of :class:`Flag`: no sequence has such a frame.
-        cuts, duplicates, bars: whether sequences end at cuts, leave repeats out, and do without bars.
-    """
-
-    skipped: int
-    cuts: bool
-    duplicates: bool
-    bars: bool
-
-    @classmethod
-    def of(cls, spec: StreamSpec) -> Cleaning:
-        """Return that of a spec with scene "auto"."""
-        kept = spec.kept_defects
-        skipped = sum(flag for kind, flag in _SKIPPED.items() if kind not in kept)
-        return cls(skipped, "cuts" not in kept, "duplicates" not in kept, "bars" not in kept)
-
-
 class Runs:
-    """The usable pieces of videos, and the runs that they form.
+    """The pieces of videos that a spec with scene "auto" uses, and the runs that they form.
 
     Attributes:
         piece_first, piece_run: [U] first frame and run of each usable piece.
@@ -63,15 +40,15 @@ class Runs:
         sides: [R, 4], bars.
     """
 
-    def __init__(self, split: SplitVideos, cleaning: Cleaning) -> None:
-        pieces: Pieces = split.pieces
+    def __init__(self, split: SplitVideos, spec: StreamSpec) -> None:
+        pieces, kept = split.pieces, spec.kept_defects
         flags, owners, firsts = pieces["flags"], split.owners(), split.firsts()
-        sides = sides_of(pieces) if cleaning.bars else np.zeros((len(pieces), 4), np.uint16)
-        skipped = (flags & cleaning.skipped) != 0
-        repeated = (flags & (Flag.REPEAT if cleaning.duplicates else 0)) != 0
+        sides = sides_of(pieces) if "bars" not in kept else np.zeros((len(pieces), 4), np.uint16)
+        skipped = (flags & sum(flag for kind, flag in _SKIPPED.items() if kind not in kept)) != 0
+        repeated = (flags & (Flag.REPEAT if "duplicates" not in kept else 0)) != 0
         begins = skipped | (np.diff(owners, prepend=-1) != 0)
         begins[1:] |= skipped[:-1] | (sides[1:] != sides[:-1]).any(axis=1)
-        if cleaning.cuts:
+        if "cuts" not in kept:
             begins |= (flags & Flag.CUT) != 0
         usable = ~skipped & ~repeated
         runs, self.piece_run = np.unique(np.cumsum(begins)[usable], return_inverse=True)
@@ -130,7 +107,7 @@ class SplitSequences:
     ) -> None:
         self._split, self._whole = split, whole
         self._strides = strides
-        self._runs = runs = Runs(split, Cleaning.of(spec))
+        self._runs = runs = Runs(split, spec)
         each = np.maximum((runs.frames - 1) // strides[runs.owners], 0)
         each[whole[runs.owners] == 0] = 0
         barred = np.flatnonzero(runs.sides.any(axis=1))

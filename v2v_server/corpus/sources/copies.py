@@ -441,14 +441,6 @@ class Copies(VideoSource):
         elif id in self._objects:
             yield id
 
-    def has(self, files: Mapping[str, str]) -> bool:
-        """Return whether the copies are there, see :meth:`CopyFolder.has`."""
-        return self.copies.has(files)
-
-    def fetch(self, files: Mapping[str, str]) -> None:
-        """Fetch the copies that are missing, see :meth:`CopyFolder.fetch`."""
-        self.copies.fetch(files)
-
     def open_local(self, id: str, fingerprint: str) -> AbstractContextManager[Path]:
         """Lend the copy of a video, see :meth:`CopyFolder.lend`."""
         return self.copies.lend(id, fingerprint)

@@ -15,10 +15,11 @@ import hashlib
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import IO
 
-from v2v_protocol.errors import CorpusError, VideoUnreadable
+from v2v_protocol.errors import CorpusError, VideoUnreadable, system_errors
 from v2v_server.store.quota import PARTIAL, QuotaFolder
 from v2v_server.system.process import locked, make_private
 
@@ -56,10 +57,8 @@ class CopyFolder:
         Raises:
             CorpusError: it cannot be created or written to.
         """
-        try:
+        with system_errors(CorpusError, f"--copies {self.folder}: cannot be written to"):
             self._quota.make()
-        except OSError as error:
-            raise CorpusError(f"--copies {self.folder}: cannot be written to: {error.strerror or error}") from error
 
     def has(self, files: Mapping[str, str]) -> bool:
         """Return whether the copies are there. If so, they stay until others are asked for, or fetched."""
@@ -115,7 +114,7 @@ class CopyFolder:
             fingerprint: the full one.
         """
         # A link, because another process may be reading the copy under its first name, which then stays.
-        with contextlib.suppress(OSError), self._locked_slot(_slot_number(id)) as slot:
+        with contextlib.suppress(OSError), self._locked_slot(id) as slot:
             slot.unlink(missing_ok=True)
             try:
                 slot.hardlink_to(self._path(id, found))
@@ -147,22 +146,20 @@ class CopyFolder:
 
     def _get(self, id: str, fingerprint: str) -> IO[bytes]:
         """Fetch a video, and return its copy, locked against eviction."""
-        try:
-            with self._locked_slot(_slot_number(id)) as slot:
-                held = self._hold(self._path(id, fingerprint)) if fingerprint else None  # another process was faster
-                return held or self._fetch(id, fingerprint, slot)
-        except OSError as error:
-            why = f"cannot be copied to {self.folder}: {error.strerror or error}"
-            raise VideoUnreadable(id, None, why) from error
+        unreadable = partial(VideoUnreadable, id, None)
+        with system_errors(unreadable, f"cannot be copied to {self.folder}"), self._locked_slot(id) as slot:
+            held = self._hold(self._path(id, fingerprint)) if fingerprint else None  # another process was faster
+            return held or self._fetch(id, fingerprint, slot)
 
     @contextlib.contextmanager
-    def _locked_slot(self, number: int) -> Iterator[Path]:
-        """Lend a file to fetch into: the one of this number, or the next one if another process holds it.
+    def _locked_slot(self, id: str) -> Iterator[Path]:
+        """Lend a file to fetch into: the one of this id, or the next one if another process holds it.
 
         Raises:
             OSError: other processes hold all of them.
         """
         end, held = time.monotonic() + _SLOT_SECONDS, contextlib.ExitStack()
+        number = int(hashlib.sha256(id.encode()).hexdigest(), 16)
         for other in range(_SLOTS):
             slot = self.folder / PARTIAL / f"{(number + other) % _SLOTS:02}"
             with contextlib.suppress(BlockingIOError):
@@ -202,10 +199,6 @@ class CopyFolder:
             f"its {slot.stat().st_size} bytes do not fit beside the {self._quota.used_bytes} bytes that are being read"
         )
         raise VideoUnreadable(id, None, f"{why}: raise --copies-gib")
-
-
-def _slot_number(id: str) -> int:
-    return int(hashlib.sha256(id.encode()).hexdigest(), 16)
 
 
 def _close(held: Mapping[tuple[str, str], IO[bytes]]) -> None:

@@ -319,8 +319,7 @@ def open_source(name: str, options: SourceOptions) -> Folder:
         CorpusError: there is none.
         OSError: this user may not look at it.
     """
-    root, listed = locate(name, options)
-    return Folder(root, listed)
+    return Folder(*locate(name, options))
 
 
 def locate(name: str, options: SourceOptions) -> tuple[Path, Callable[[], tuple[ListEntry, ...] | None]]:

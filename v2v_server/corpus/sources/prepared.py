@@ -22,7 +22,7 @@ from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, TypeAlias
 
-from v2v_protocol.errors import CorpusError, ProtocolError, UsageError
+from v2v_protocol.errors import CorpusError, ProtocolError, UsageError, system_errors
 from v2v_protocol.persisted import Limits, Persisted, later, parse_json
 from v2v_protocol.programs import printable
 from v2v_protocol.write_aside import write_aside_and_rename
@@ -127,10 +127,8 @@ def read_manifest(root: Path) -> Manifest:
         CorpusError: it cannot be read, or is no manifest of this version.
     """
     path = root / MANIFEST_NAME
-    try:
+    with system_errors(CorpusError, f"{path}: cannot be read"):
         lines = path.read_bytes().split(b"\n")
-    except OSError as error:
-        raise CorpusError(f"{path}: cannot be read: {error.strerror or error}") from error
     lines.pop()  # empty behind the last line's end; else the beginning of a line whose writer was killed
     if not lines:
         raise CorpusError(f"{path}: holds no whole line; prepare another folder")

@@ -24,7 +24,7 @@ from typing import Any
 
 import msgpack
 
-from v2v_protocol.errors import CorpusError, VideoGone, VideoUnreadable
+from v2v_protocol.errors import CorpusError, VideoGone, VideoUnreadable, system_errors
 from v2v_protocol.persisted import reader, to_plain
 from v2v_server.corpus.sources.copy_folder import CopyFolder
 from v2v_server.corpus.sources.listing import ListEntry, read_list
@@ -293,14 +293,16 @@ class VideoSource(ABC):
         Args:
             files: their fingerprints, by id.
         """
-        return True
+        return self.copies is None or self.copies.has(files)
 
-    def fetch(self, files: Mapping[str, str]) -> None:  # noqa: B027 - a local source has nothing to fetch
+    def fetch(self, files: Mapping[str, str]) -> None:
         """Do the part of :meth:`open_local` that needs the network, so that :meth:`has` returns True.
 
         Raises:
             VideoUnreadable, VideoChanged: a file cannot be fetched, or differs.
         """
+        if self.copies is not None:
+            self.copies.fetch(files)
 
 
 def rate_of(source: VideoSource, id: str) -> float:
@@ -334,12 +336,11 @@ def open_source(name: str | os.PathLike[str], options: SourceOptions = SourceOpt
         UsageError: an address or a setting is malformed.
     """
     name = os.fspath(name)
-    try:
+    # A folder that this user may not enter, or a share that has gone.
+    with system_errors(CorpusError, f"{name}: cannot be read"):
         for kind in SOURCE_KINDS:
             source: VideoSource | None = import_module(f"{__package__}.{kind}").open_source(name, options)
             if source is not None:
                 source.kind = options.kind
                 return source
-    except OSError as error:  # a folder that this user may not enter, a share that has gone
-        raise CorpusError(f"{name}: cannot be read: {error.strerror or error}") from error
     raise CorpusError(f"{name}: neither a folder, a video, a list file nor an address of a known form")
