@@ -686,8 +686,10 @@ class Recipe(Persisted):
 
         ``levels_per_step``: see :meth:`worst_events`.
         """
-        inner = self.spans * self.bins if self.is_timed else steps * max(0, self.grids_per_frame * self.bins - 1)
-        return (steps * (1 + levels_per_step) + inner) * (MOST_BAND_PARTS if any(self.noise_band_share) else 1)
+        return (MOST_BAND_PARTS if any(self.noise_band_share) else 1) * (
+            steps * (1 + levels_per_step)
+            + (self.spans * self.bins if self.is_timed else steps * max(0, self.grids_per_frame * self.bins - 1))
+        )
 
     @property
     def frames_needed(self) -> int:
