@@ -56,6 +56,8 @@ LARGEST_NORMAL = 6.56
 """No noise deviates by more standard deviations (``v2v_server.simulation.noise``)."""
 LARGEST_EVENTS = 2.0**49
 """Largest number of events of a pixel in a clip. With more, float64 no longer resolves a threshold."""
+MOST_BAND_PARTS = 8
+"""Most parts of a segment that noise below a corner is drawn for."""
 
 
 class Worst(NamedTuple):
@@ -679,9 +681,15 @@ class Recipe(Persisted):
         """Differences between consecutive frames in a sample, lead voxel included."""
         return self.spans * self.steps_per_frame
 
-    def most_segments(self, steps: int) -> int:
-        """Return the largest number of segments (``Timeline``) of a sample with this number of steps."""
-        return steps + self.spans * self.bins if self.is_timed else steps * max(1, self.grids_per_frame * self.bins)
+    def most_segments(self, steps: int, levels_per_step: int = 0) -> int:
+        """Return the largest number of segments (``Timeline``) of a sample with this number of steps.
+
+        ``levels_per_step``: see :meth:`worst_events`.
+        """
+        return (MOST_BAND_PARTS if any(self.noise_band_share) else 1) * (
+            steps * (1 + levels_per_step)
+            + (self.spans * self.bins if self.is_timed else steps * max(0, self.grids_per_frame * self.bins - 1))
+        )
 
     @property
     def frames_needed(self) -> int:
@@ -738,7 +746,7 @@ class Recipe(Persisted):
         ends = math.log(self.log_eps[0]), math.log1p(self.log_eps[1] + (brightest - 1.0))
         unit = step_seconds if self.noise_unit == "second" else 1.0
         steps = self.spans * int(self.steps_at(self.frame_stride / step_seconds))
-        segments = self.most_segments(steps) + steps * levels_per_step
+        segments = self.most_segments(steps, levels_per_step)
         worst = worst_of({name: getattr(self, name) for name in effect_settings()}, segments, steps * step_seconds)
         return most_events(segments, ends, (low, high), steps * (sigma * math.sqrt(unit) + hot * unit), *worst)
 

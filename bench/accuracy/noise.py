@@ -8,9 +8,8 @@ Thresholds 0.2, mismatch 0.14, triangular start. A distance is half the sum of t
 of the signed events of a pixel in a step, and of the events of a pixel in a second.
 
 Bars: opposite signs within .03, rates within 10 %, distances of signed bins of moving light below .04, of counts below
-.1. Where fewer than 400 events were counted, only the counts are judged. The law has two limits, which miss bars: with
-h = 2 pi f T from 1.3 to 2.4, x and the extremes are not independent as it takes them to be; and with h above 12 a step
-has one excursion each way. Where a step is divided (``grids_per_frame``, ``voxel_seconds``), h is that of its parts.
+.1. Where fewer than 400 events were counted, only the counts are judged. The kernel divides
+a step whose h = 2 pi f T lies from 1.2 to 2.4 or above 8 (``v2v_server/simulation/effects/noise_band.py``).
 """
 
 from __future__ import annotations

@@ -19,6 +19,7 @@ from v2v_protocol.recipe import Worst, worst_of
 from v2v_protocol.sample import ARRAYS, EventShape, SampleParams, html_table
 from v2v_protocol.spec import VOXEL_DTYPES
 from v2v_server.simulation import effects
+from v2v_server.simulation.effects import noise_band
 from v2v_server.simulation.effects.kernel import FIXED, TRIANGULAR, UNIFORM, Segments, simulate_general
 from v2v_server.simulation.intensity import Intensity, fine_table, log_table, log_table_float64
 from v2v_server.simulation.pixel import hot_pixels, simulate_pixels
@@ -115,9 +116,13 @@ class KernelInput:
 
     @property
     def segments(self) -> int:
-        """An upper bound of the number of segments."""
-        divided = int(np.count_nonzero(self.edges.share))
-        return len(self.noise_durations) + divided + (0 if self.levels is None else len(self.levels.at.step))
+        """The number of segments, or an upper bound of it where no effect divides them."""
+        if self.params.effects.get(noise_band.FIELD):
+            return len(self.timeline().step)
+        return (
+            len(self.noise_durations) + int(np.count_nonzero(self.edges.share))
+            + (0 if self.levels is None else len(self.levels.at.step))
+        )  # fmt: skip
 
     @property
     def worst(self) -> Worst:
@@ -128,7 +133,9 @@ class KernelInput:
     def timeline(self) -> Timeline:
         """Divide the clip into segments."""
         durations = self.step_seconds if self.grids_have_durations else np.ones(len(self.step_seconds))
-        return timeline(self.edges, self.bins, durations, None if self.levels is None else self.levels.at)
+        given = self.edges, self.bins, durations, None if self.levels is None else self.levels.at
+        whole, (share, corner) = timeline(*given), map(self.params.effects.get, (noise_band.FIELD, "noise_band_hz"))
+        return timeline(*given, noise_band.moments(whole, self.step_seconds, corner)) if share and corner else whole
 
     def form(self, name: str) -> tuple[str, tuple[int, ...]]:
         """Return dtype and shape of a representation."""

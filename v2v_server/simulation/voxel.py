@@ -140,20 +140,23 @@ def time_of(moments: Moments, durations: Doubles, since: Doubles | None = None) 
     return np.asarray(since[moments.step] + moments.share * np.append(durations, 0.0)[moments.step])
 
 
-def timeline(edges: Moments, bins: int, durations: Doubles, levels: Moments | None = None) -> Timeline:
-    """Divide a clip into segments at its frames, at the edges of its bins and at intermediate levels.
+def timeline(
+    edges: Moments, bins: int, durations: Doubles, levels: Moments | None = None, others: Moments | None = None
+) -> Timeline:
+    """Divide a clip into segments at its frames, at the edges of its bins, at intermediate levels and other moments.
 
     Args:
         edges: [M + 1] ends of the bins, from the clip's start to its end.
         bins: bins of a voxel grid.
         durations: [steps] of each step, in any unit.
         levels: moments of intermediate levels.
+        others: further moments.
     """
     steps = len(durations)
     frames, none = Moments(np.arange(steps + 1), np.zeros(steps + 1)), Moments(np.empty(0, np.int64), np.empty(0))
-    parts = frames, edges, levels or none
+    parts = frames, edges, levels or none, others or none
     step, share = (np.concatenate([np.asarray(part[axis]) for part in parts]) for axis in (0, 1))
-    kind = np.repeat(np.arange(3), [len(part.step) for part in parts])
+    kind = np.repeat(np.arange(4), [len(part.step) for part in parts])
     number = np.concatenate([np.arange(len(part.step)) for part in parts])
     order = np.lexsort((kind, share, step))
     step, share, kind, number = step[order], share[order], kind[order], number[order]
@@ -161,7 +164,7 @@ def timeline(edges: Moments, bins: int, durations: Doubles, levels: Moments | No
     moment = np.cumsum(first) - 1  # of each entry
     step, share = step[first], share[first]
     is_known = np.zeros(len(step), np.bool_)
-    is_known[moment[kind != 1]] = True
+    is_known[moment[kind % 2 == 0]] = True
     level = np.zeros(len(step), np.int64)
     level[moment[kind == 2]] = -1 - number[kind == 2]
     level[moment[kind == 0]] = number[kind == 0]

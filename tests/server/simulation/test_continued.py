@@ -59,7 +59,7 @@ def test_pieces_have_the_events_of_one_run(
 ) -> None:
     effects = {name: EFFECTS[name] for name in names}
     if "noise_band_share" in names:
-        effects["noise_band_hz"] = 30.0  # both forms of its law: steps of .04 s, and their parts
+        effects["noise_band_hz"] = 30.0 if has_levels else 90.0  # both forms of its law; steps that it divides
     given = clip_of(effects, has_levels=has_levels)
     clip = ContinuedClip(real, most)
     found = list[EventList]()

@@ -7,12 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from bench.accuracy.noise import Setup, distance, scene_of, simulated, true
 from v2v_protocol.errors import RecipeError, UsageError
-from v2v_protocol.recipe import Recipe, most_events
+from v2v_protocol.recipe import MOST_BAND_PARTS, Recipe, most_events
 from v2v_server.simulation import simulate
-from v2v_server.simulation.effects.noise_band import laws_of
+from v2v_server.simulation.effects.noise_band import LONGEST_BRIDGE, LONGEST_BULK, laws_of, moments
+from v2v_server.simulation.voxel import bin_edges, timeline
 
 STILL = np.full((61, 32, 32), 128, np.uint8)
 NOISE: dict[str, Any] = {"threshold_pos": 0.2, "noise_band_share": 0.3, "noise_band_hz": 35.0, "bins": 5}
@@ -20,9 +23,12 @@ NOISE: dict[str, Any] = {"threshold_pos": 0.2, "noise_band_share": 0.3, "noise_b
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", ["still", "sine", "ramp"])
-@pytest.mark.parametrize("step_ms", [1, 8, 33])
-def test_events_are_those_of_the_continuous_process(scene: str, step_ms: int) -> None:
-    setup = Setup(scene, 0.22, 35.0, step_ms)
+@pytest.mark.parametrize(
+    ("share", "corner_hz", "step_ms"),
+    [(0.22, 35.0, 1), (0.22, 35.0, 8), (0.22, 35.0, 33), (0.3, 35.0, 8), (0.3, 10.0, 33), (0.3, 100.0, 33)],
+)
+def test_events_are_those_of_the_continuous_process(scene: str, share: float, corner_hz: float, step_ms: int) -> None:
+    setup = Setup(scene, share, corner_hz, step_ms)
     frames = scene_of(setup)
     found, expected = simulated(setup, frames), true(setup, frames)
     assert (found.on + found.off).sum() == pytest.approx((expected.on + expected.off).sum(), rel=0.1)
@@ -37,6 +43,27 @@ def test_the_end_of_a_step_is_exact(step_ms: float) -> None:
     _, rho, scale, *_ = laws_of(np.array([h]), 0.05)[0]
     assert rho == pytest.approx(math.exp(-h), rel=1e-12)
     assert scale**2 / (1 - rho**2) == pytest.approx(0.05**2, rel=1e-12)
+
+
+@given(st.floats(1e-3, 64.0))
+def test_a_step_is_divided_where_no_form_of_the_law_has_it(h: float) -> None:
+    corner_hz = h / (2 * math.pi * 0.5)
+    whole = timeline(bin_edges(2, 1), 1, np.ones(2))
+    count = len(moments(whole, np.full(2, 0.5), corner_hz).step) // 2
+    assert h / count <= LONGEST_BRIDGE * (1 + 1e-9) or 2 * LONGEST_BRIDGE < h / count <= LONGEST_BULK * (1 + 1e-9)
+    assert count == 1 or not (h <= LONGEST_BRIDGE or 2 * LONGEST_BRIDGE * (1 + 1e-9) < h <= LONGEST_BULK)
+
+
+@pytest.mark.parametrize(("h", "count"), [(1.8, 2), (12.0, 2), (20.7, 3), (30.0, 4)])
+def test_parts_of_a_step_are_those_of_shorter_grids(h: float, count: int) -> None:
+    """The events, in bins of all steps and in bins of their parts, and between levels that move."""
+    frames = np.random.default_rng(3).integers(90, 130, (9, 12, 16)).astype(np.uint8)
+    asked = NOISE | {"bins": 1, "noise_band_hz": 30.0 * h / (2 * math.pi), "frames_per_second": 30.0, "dtype": "int16"}
+    whole, fine = (simulate(frames, **asked, grids_per_frame=grids) for grids in (0, count))
+    counts = fine.array("event_counts")
+    assert counts.sum() > 1000
+    np.testing.assert_array_equal(whole.array("event_counts"), counts.reshape(8, count, *counts.shape[1:]).sum(axis=1))
+    np.testing.assert_array_equal(whole.to_events(4e6 / 120).t, fine.to_events(4e6 / 120 / count).t)
 
 
 def test_signs_alternate_in_the_list_of_events() -> None:
@@ -68,10 +95,12 @@ def test_arrays_count_the_events_of_the_list() -> None:
 
 
 def test_the_bound_of_events_holds_for_the_loudest_noise() -> None:
-    made = simulate(STILL, **NOISE | {"noise_band_share": 10.0, "noise_band_hz": 1e4}, frames_per_second=30.0)
+    made = simulate(STILL[:21], **NOISE | {"noise_band_share": 10.0, "noise_band_hz": 1e4}, frames_per_second=30.0)
     most = made.array("event_counts").sum(axis=(0, 1, 2)).max()
     quiet = most_events(made.given.segments, (0.0, 0.0), (0.2, 0.2), 0.0)
     assert quiet < most <= most_events(made.given.segments, (0.0, 0.0), (0.2, 0.2), 0.0, *made.given.worst)
+    recipe = Recipe(noise_band_share=(0.0, 0.1), noise_band_hz=(10.0, 1e4))
+    assert made.given.segments == 20 * MOST_BAND_PARTS == recipe.most_segments(20)
 
 
 def test_noise_without_a_corner_is_refused() -> None:

@@ -14,8 +14,11 @@ and the bottom alike, mirrored, with E-. A, B and G fit P(max < u) = exp(-lambda
 at which the process leaves (-inf, u); a Brownian bridge with a pull to zero is the second form. Three straight legs
 (:func:`divide`) then pass the comparator: to one extreme, to the other one, to x'. The bridge visits the extreme next
 to x first and takes a third of the time for each leg. Else the order is a coin, the first leg ends at a uniform time,
-the second in the middle of what is left; a block of pixels shares these times. ``python -m bench noise`` compares with
-the continuous process.
+the second in the middle of what is left; a block of pixels shares these times.
+
+Two ranges of h are left out by dividing a step into equal parts (:func:`moments`). With h from 1.2 to 2.4, x and the
+extremes depend on each other, and neither form has it. With h above 8, there is time for several excursions each way,
+and the law has one. ``python -m bench noise`` compares with the continuous process.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-calls
@@ -26,16 +29,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import MOST_BAND_PARTS
 from v2v_server.simulation.effects.state import Clip, compiled, hook
 from v2v_server.simulation.intensity import Doubles, exponential, logarithm
 from v2v_server.simulation.pixel import PIXELS_A_BLOCK, crossed, folds_of, half_mixed, minus_two_ln, two_normals, word
 from v2v_server.simulation.vectors import use_widest_vectors
+from v2v_server.simulation.voxel import Moments, Timeline
 
 FIELD, ROWS = "noise_band_share", 3
 NOISE, PANEL = True, "still"
 PURPOSES = PIXEL_RADIUS, PIXEL_ANGLE, PAIR_RADIUS, PAIR_ANGLE, PIXEL, STEP = range(16, 22)
 LONGEST_BRIDGE = 1.2
 """Largest h of the second form."""
+LONGEST_BULK = 8.0
+"""Largest h of a part, unless a step would need more than MOST_BAND_PARTS."""
 EXTREMES = np.array([
     (1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 10.0, 14.0, 20.0, 30.0, 45.0, 64.0),
     (-2.7723, -1.9005, -1.3262, -0.9698, -0.7241, -0.5339, -0.4259, -0.2238, -0.0930, -0.0571, -0.0264, 0.0197, 0.1469,
@@ -81,6 +88,16 @@ def prepare(value: float, clip: Clip) -> Tables:
     laws = laws_of(2.0 * np.pi * corner * clip.durations, sigma) if value > 0.0 else np.empty((0, 6))
     words, is_blind = np.empty((3, PIXELS_A_BLOCK), np.uint32), clip.effects.get("refractory_seconds", 0.0) > 0.0
     return Tables(laws.astype(clip.real), clip.table_of_step, clip.real(sigma), words, np.int64(clip.first), is_blind)
+
+
+def moments(whole: Timeline, step_seconds: Doubles, corner_hz: float) -> Moments:
+    """Return the moments that divide segments into equal parts, and their starts; for ``step_seconds``, [steps]."""
+    h = 2.0 * np.pi * corner_hz * step_seconds[whole.step] * whole.share
+    is_between = (h > LONGEST_BRIDGE) & (h <= 2 * LONGEST_BRIDGE)
+    parts = np.where(is_between, 2, np.clip(np.ceil(h / LONGEST_BULK), 1, MOST_BAND_PARTS)).astype(np.int64)
+    of = np.repeat(np.arange(len(h)), parts)
+    passed = (np.arange(len(of)) - np.searchsorted(of, of)) / parts[of]
+    return Moments(whole.step[of], whole.start[of] + whole.share[of] * passed)
 
 
 def laws_of(steps: Doubles, sigma: float) -> Doubles:
