@@ -260,6 +260,10 @@ TIME_UNITS = ("Hz", "s")
 """An effect in one of these needs the time between frames."""
 STARTS = ("uniform", "triangular", "zero")
 """How the residual of a pixel is drawn at the start of a clip (``v2v_server/simulation/pixel.py``)."""
+FRAMES = "frames"
+"""The start of a recipe whose residuals are what frames before the clip leave."""
+_RUN_IN_FRAMES, _RUN_IN_SECONDS = 5, 0.15
+"""These frames last at least so long, at the average rate, and are at least as many."""
 _LARGEST_FRAMES = 1_000_001
 MOST_STEPS_PER_GRID = 1024
 """Largest number of steps between video frames that a grid of ``voxel_seconds`` may span."""
@@ -375,9 +379,10 @@ class Recipe(Persisted):
         "if it states any)",
     )  # fmt: skip
     start: str = word(
-        "uniform", STARTS,
+        "uniform", (*STARTS, FRAMES),
         "residual of each pixel at the start of a clip, between its thresholds: uniform, as in the paper's code; "
-        "triangular, as in a camera that has run for a long time; zero, as if each pixel had just fired",
+        "triangular, as in a camera that has run for a long time; zero, as if each pixel had just fired; frames, what "
+        "at least 5 frames and 0.15 s before the clip leave, which are simulated and thrown away, else triangular",
         is_later=True,
     )  # fmt: skip
     noise_sigma: Range = span(
@@ -648,6 +653,20 @@ class Recipe(Persisted):
         """
         return self.sequence_at(frames_per_second) * (2 if self.is_timed else 1)
 
+    def run_in_at(self, frames_per_second: npt.ArrayLike) -> npt.NDArray[np.int64]:
+        """Return how many frames before its first one a sample of videos of these rates starts from, those included
+        that the stride leaves out, [videos]; unknown rates count as 0.
+        """
+        seconds = np.nan_to_num(np.asarray(frames_per_second, np.float64), nan=0.0) * _RUN_IN_SECONDS
+        steps = np.maximum(np.ceil(seconds / self.frame_stride - 1e-6), _RUN_IN_FRAMES).astype(np.int64)
+        return steps * (self.frame_stride if self.start == FRAMES else 0)
+
+    def held_at(self, frames_per_second: npt.ArrayLike) -> npt.NDArray[np.int64]:
+        """Return the largest number of frames beside its first one that a sample of videos of these rates may use,
+        before it (:meth:`run_in_at`) and after it (:meth:`reach_at`), [videos].
+        """
+        return self.run_in_at(frames_per_second) + self.reach_at(frames_per_second)
+
     @property
     def voxel_grids(self) -> int:
         """Voxel grids of a sample: T + lead_voxels, times ``grids_per_frame`` if that is set."""
@@ -737,7 +756,8 @@ class Recipe(Persisted):
         brightest = 1.0 if self.light == "sdr" else BRIGHTEST
         ends = math.log(self.log_eps[0]), math.log1p(self.log_eps[1] + (brightest - 1.0))
         unit = step_seconds if self.noise_unit == "second" else 1.0
-        steps = self.spans * int(self.steps_at(self.frame_stride / step_seconds))
+        rate = self.frame_stride / step_seconds
+        steps = self.spans * int(self.steps_at(rate)) + int(self.run_in_at(rate)) // self.frame_stride
         segments = self.most_segments(steps) + steps * levels_per_step
         worst = worst_of({name: getattr(self, name) for name in effect_settings()}, segments, steps * step_seconds)
         return most_events(segments, ends, (low, high), steps * (sigma * math.sqrt(unit) + hot * unit), *worst)
