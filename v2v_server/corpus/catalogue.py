@@ -529,8 +529,7 @@ def complete_lease(lease: Lease, catalogue: Catalogue, spec: StreamSpec) -> Leas
         V2VError: the index of this video is damaged, or belongs to another file.
     """
     video, start, recipe, part = lease.video, lease.start_frame, spec.recipe, b""
-    first, run_in, scene = start, int(recipe.run_in_at(lease.frames_per_second)), None
-    has_repeats = "duplicates" in spec.kept_defects
+    run_in, scene, has_repeats = int(recipe.run_in_at(lease.frames_per_second)), None, "duplicates" in spec.kept_defects
     if spec.scene == "off":
         count = int(recipe.reach_at(lease.frames_per_second)) + 1
         if recipe.is_timed and (number := catalogue.videos.find(video)) is not None:
@@ -539,10 +538,10 @@ def complete_lease(lease: Lease, catalogue: Catalogue, spec: StreamSpec) -> Leas
         scene, count = catalogue.scene(video), int(recipe.sequence_at(lease.frames_per_second)) + 1
         if not has_repeats:
             count = int(scene.frames_from(start, count)[-1]) + 1 - start
-    if run_in:
-        first = min((start, *frames_before(scene, start, run_in, has_repeats=has_repeats).tolist()))
+    first = min((start, *frames_before(scene, start, run_in, has_repeats=has_repeats).tolist()))
     if scene is not None:
-        part = scene.slice(first, start + count - first).to_bytes()
+        known = 0 if run_in and first == start else first  # its worker sees that the shot has too few
+        part = scene.slice(known, start + count - known).to_bytes()
     sidecars = dict(lease.sidecars)
     for ending in sidecar_endings(lease.arrays):
         mark = lease.sidecars.get(ending, "")

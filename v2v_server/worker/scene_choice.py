@@ -54,7 +54,6 @@ from v2v_server.video.decode import DecodedClip
 from v2v_server.worker.job import ClipJob
 
 _LONGEST = np.iinfo(np.int16).max
-_NONE = np.empty(0, np.int64)
 LEAN_METHOD = "dis-fast-lean"
 TOLERANCE_PX = 0.05
 """Largest addition of the choice to the median endpoint error of "auto", over a corpus (docs/scene.md)."""
@@ -88,13 +87,11 @@ class CleanFrames:
             count: frames of the sequence, those that the stride leaves out included.
             run_in: frames before it that are wanted, those included too.
         """
-        stride, kept, before = spec.recipe.frame_stride, spec.kept_defects, _NONE
+        stride, kept = spec.recipe.frame_stride, spec.kept_defects
         numbers = start_frame + np.arange(count, dtype=np.int64)
         if scene is not None and "duplicates" not in kept:
             numbers = scene.frames_from(start_frame, count)
-        if run_in:
-            found = frames_before(scene, start_frame, run_in, has_repeats="duplicates" in kept)
-            before = found if len(found) == run_in else _NONE
+        before = frames_before(scene, start_frame, run_in, has_repeats="duplicates" in kept)
         is_even = int(numbers[-1]) - min((start_frame, *before[:1].tolist())) < count + len(before)
         sides = NO_BARS if scene is None or "bars" in kept else scene.sides(start_frame, int(numbers[-1]) + 1)
         return cls(numbers[::stride], stride if is_even else 0, sides, before[::stride])

@@ -119,17 +119,17 @@ def clip_pieces(pieces: Pieces, first: int, start: int, end: int) -> Pieces:
 
 
 def frames_before(scene: Scene | None, start: int, count: int, *, has_repeats: bool) -> npt.NDArray[np.int64]:
-    """Return the ordinals of the last frames before frame ``start`` in its shot, ascending, [count] or fewer.
+    """Return the ordinals of the last frames before frame ``start``, ascending, [count]; none if its shot has fewer.
 
     Args:
-        scene: of the video, or a slice that begins with the first of them; None: without shots.
+        scene: of the video, or a slice that begins with the first of them, or with the video; None: without shots.
         has_repeats: whether frames that repeat the one before them count.
     """
     shots = () if scene is None else scene.shot_boundaries
     repeats = np.empty(0, np.int64) if scene is None or has_repeats else scene.repeats[scene.repeats < start]
     first = max((0, start - count - len(repeats), *(shot for shot in shots if shot <= start)))
     found = np.setdiff1d(np.arange(first, start), repeats, assume_unique=True)
-    return found[max(0, len(found) - count) :]
+    return found[len(found) - count :] if len(found) >= count else found[:0]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
