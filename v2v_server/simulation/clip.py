@@ -229,17 +229,17 @@ def simulate_clip(
     )  # fmt: skip
     if run_in is None or recipe.start != FRAMES:
         return Voxels.of(given, choose(AUTO, _most_events(given, _log_ends(intensity))), out)
-    seen, steps = run_in.frames, len(run_in.frames) - 1
-    lasting = np.ones(steps) if run_in.step_seconds is None else run_in.step_seconds
+    earlier = len(run_in.frames) - 1
+    lasting = np.ones(earlier) if run_in.step_seconds is None else run_in.step_seconds
     before = dataclasses.replace(
-        given, frames=seen, source_index=np.arange(steps + 1), step_seconds=lasting, bins=1, levels=None,
-        noise_durations=lasting if recipe.noise_unit == "second" else np.ones(steps), edges=bin_edges(steps, steps),
-        grids_have_durations=False,
+        given, frames=run_in.frames, source_index=np.arange(earlier + 1), step_seconds=lasting, bins=1, levels=None,
+        noise_durations=lasting if recipe.noise_unit == "second" else np.ones(earlier),
+        edges=bin_edges(earlier, earlier), grids_have_durations=False,
     )  # fmt: skip
-    both = dataclasses.replace(given, **{
-        name: np.concatenate([getattr(each, name) for each in (before, given)])
-        for name in ("noise_durations", "step_seconds")
-    })  # fmt: skip
+    both = dataclasses.replace(
+        given, noise_durations=np.concatenate((before.noise_durations, given.noise_durations)),
+        step_seconds=np.concatenate((lasting, step_seconds)),
+    )  # fmt: skip
     real = choose(AUTO, _most_events(both, _log_ends(intensity)))
     return Voxels.of(following(given, before, real), real, out)
 

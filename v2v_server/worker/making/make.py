@@ -134,7 +134,7 @@ def span_ends_us(clip: ClipJob, decoded: Decoded) -> npt.NDArray[np.int64]:
     Raises:
         VideoError: the video's frame rate is unknown.
     """
-    seconds, _ = _step_seconds(clip, decoded)
+    seconds, _ = _step_seconds(clip, decoded.clip.seconds, decoded.plan.source)
     times_us = whole_edges(1e6 * np.concatenate([[0.0], np.cumsum(seconds)]))
     return times_us[decoded.plan.params.ends(clip.spec.recipe)]
 
@@ -164,10 +164,12 @@ def sample_context(
         levels = levels_of(part, params, recipe, plan.source, spec.substep_px, read.motion, picture)
     # An array must not make a video unusable for the others: without a rate, it is left empty.
     is_timed = recipe.needs_seconds or needs.seconds == "must" or (bool(clip.frames_per_second and needs.seconds))
-    seconds, irregular = _step_seconds(clip, decoded) if is_timed else (None, 0)
+    seconds, irregular = _step_seconds(clip, read.seconds, plan.source) if is_timed else (None, 0)
     view, run_in = _seen(clip, decoded, frames), None
     if decoded.before is not None and needs.events:
-        earlier = None if seconds is None else _durations(clip, decoded.before.seconds, np.arange(plan.run_in + 1))[0]
+        earlier = (
+            None if seconds is None else _step_seconds(clip, decoded.before.seconds, np.arange(plan.run_in + 1))[0]
+        )
         run_in = RunIn(_seen(clip, decoded, decoded.before.frames), earlier)
     origin = SourceClip(
         clip.start_frame,
@@ -228,14 +230,10 @@ def _grid_seconds(context: SampleContext) -> tuple[float, ...]:
     return tuple(np.add.reduceat(context.step_seconds, context.params.ends(context.recipe)[:-1]).tolist())
 
 
-def _step_seconds(clip: ClipJob, decoded: Decoded) -> tuple[npt.NDArray[np.float64], int]:
-    """Call :func:`step_seconds` for a clip."""
-    return _durations(clip, decoded.clip.seconds, decoded.plan.source)
-
-
-def _durations(
+def _step_seconds(
     clip: ClipJob, seconds: npt.NDArray[np.float64], source: npt.NDArray[np.int64]
 ) -> tuple[npt.NDArray[np.float64], int]:
+    """Call :func:`step_seconds` for frames of a clip."""
     if not clip.frames_per_second:
         why = "the recipe needs seconds" if clip.spec.recipe.needs_seconds else "events need times"
         raise VideoError(clip.video, None, f"its frame rate is unknown, and {why}")
