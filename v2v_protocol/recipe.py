@@ -274,7 +274,7 @@ STARTS = ("uniform", "triangular", "zero")
 FRAMES = "frames"
 """The start of a recipe whose residuals are what frames before the clip leave."""
 _RUN_IN_FRAMES, _RUN_IN_SECONDS = 5, 0.15
-"""These frames last at least so long, at the average rate, and are at least as many."""
+"""Least number of these frames, and least time that they last at the average rate."""
 _LARGEST_FRAMES = 1_000_001
 MOST_STEPS_PER_GRID = 1024
 """Largest number of steps between video frames that a grid of ``voxel_seconds`` may span."""

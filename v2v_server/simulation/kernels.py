@@ -161,7 +161,7 @@ def fill(
 
 
 def new_state(given: KernelInput, real: Real) -> npt.NDArray[Any]:
-    """Return memory for what pixels remember from one piece of a clip to the next (:class:`Carried`)."""
+    """Return memory for the state of one side of :class:`Carried`, [1 + ROWS, pixels], or [1, pixels]."""
     return np.empty((1 + ROWS if given.params.effects else 1, given.frames[0].size), real)
 
 

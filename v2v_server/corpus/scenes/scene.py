@@ -206,7 +206,7 @@ class Scene:
 
     @property
     def repeats(self) -> npt.NDArray[np.int64]:
-        """Return the ordinals of the frames that repeat the one before, ascending."""
+        """Return the ordinals of the frames that repeat the one before, [n], ascending."""
         repeats = np.repeat(self.pieces["flags"] & Flag.REPEAT, self.pieces["end"] - firsts_of(self.pieces, self.first))
         return self.first + np.flatnonzero(repeats)
 
