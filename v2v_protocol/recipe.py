@@ -153,6 +153,15 @@ _RUNNING: Mapping[str, Any] = {
 stays that of the videos; for frames that are linear in intensity, as a DAVIS stores them, set it to 1.
 """
 
+_MEASURED: Mapping[str, Any] = {
+    **_RUNNING,
+    # 0.006 events a second in a DAVIS346, 2.4 in a DAVIS240C without the bursts of its exposure. A pixel of 0.27 of
+    # white has 0.8 of a black one's.
+    "shot_noise_hz": (0.0075, 3.0),
+    "leak_hz": (0.01, 0.2),  # around the surplus of brighter events in the DAVIS346, 0.015, and v2e's 0.1
+}
+"""The same with the noise of still pixels, as measured in two cameras."""
+
 PRESET_FIELDS: Mapping[str, Mapping[str, Any]] = {
     "paper": {},
     # Ablation "-F": one draw of the thresholds per video, the same in every epoch.
@@ -199,13 +208,15 @@ PRESET_FIELDS: Mapping[str, Mapping[str, Any]] = {
         "hot_pixel_sigma": (0.0, 20.0),
     },
     "davis346-running": _RUNNING,
-    # The same with the noise of still pixels, as measured in two cameras.
-    "davis346-measured": {
-        **_RUNNING,
-        # 0.006 events a second in a DAVIS346, 2.4 in a DAVIS240C without the bursts of its exposure. A pixel of 0.27 of
-        # white has 0.8 of a black one's.
-        "shot_noise_hz": (0.0075, 3.0),
-        "leak_hz": (0.01, 0.2),  # around the surplus of brighter events in the DAVIS346, 0.015, and v2e's 0.1
+    "davis346-measured": _MEASURED,
+    # The same with noise before the comparator, and the pixels of a camera that has seen what was before the clip.
+    "davis346-band": {
+        **_MEASURED,
+        "start": "frames",
+        "shot_noise_hz": (0.0, 0.0),
+        "noise_band_share": (0.08, 0.25),  # at most 0.10 in a still DAVIS346, 0.255 fitted to a DAVIS240C
+        "noise_band_hz": (15.0, 60.0),  # 26 fitted to the latter; 13 and 76 are clearly worse
+        "threshold_mismatch_sigma": (0.1, 0.18),  # 0.14 fitted to it
     },
     "worlds": _WORLDS,
     # The same, closer to light (docs/guides/photographs.md).
@@ -262,6 +273,10 @@ TIME_UNITS = ("Hz", "s")
 """An effect in one of these needs the time between frames."""
 STARTS = ("uniform", "triangular", "zero")
 """How the residual of a pixel is drawn at the start of a clip (``v2v_server/simulation/pixel.py``)."""
+FRAMES = "frames"
+"""The start of a recipe whose residuals are what frames before the clip leave."""
+_RUN_IN_FRAMES, _RUN_IN_SECONDS = 5, 0.15
+"""Least number of these frames, and least time that they last at the average rate."""
 _LARGEST_FRAMES = 1_000_001
 MOST_STEPS_PER_GRID = 1024
 """Largest number of steps between video frames that a grid of ``voxel_seconds`` may span."""
@@ -377,9 +392,10 @@ class Recipe(Persisted):
         "if it states any)",
     )  # fmt: skip
     start: str = word(
-        "uniform", STARTS,
+        "uniform", (*STARTS, FRAMES),
         "residual of each pixel at the start of a clip, between its thresholds: uniform, as in the paper's code; "
-        "triangular, as in a camera that has run for a long time; zero, as if each pixel had just fired",
+        "triangular, as in a camera that has run for a long time; zero, as if each pixel had just fired; frames, what "
+        "at least 5 frames and 0.15 s before the clip leave, which are simulated and thrown away, else triangular",
         is_later=True,
     )  # fmt: skip
     noise_sigma: Range = span(
@@ -650,6 +666,20 @@ class Recipe(Persisted):
         """
         return self.sequence_at(frames_per_second) * (2 if self.is_timed else 1)
 
+    def run_in_at(self, frames_per_second: npt.ArrayLike) -> npt.NDArray[np.int64]:
+        """Return how many frames before its first one a sample of videos of these rates starts from, those included
+        that the stride leaves out, [videos]; unknown rates count as 0.
+        """
+        seconds = np.nan_to_num(np.asarray(frames_per_second, np.float64), nan=0.0) * _RUN_IN_SECONDS
+        steps = np.maximum(np.ceil(seconds / self.frame_stride - 1e-6), _RUN_IN_FRAMES).astype(np.int64)
+        return steps * (self.frame_stride if self.start == FRAMES else 0)
+
+    def held_at(self, frames_per_second: npt.ArrayLike) -> npt.NDArray[np.int64]:
+        """Return the largest number of frames beside its first one that a sample of videos of these rates may use,
+        before it (:meth:`run_in_at`) and after it (:meth:`reach_at`), [videos].
+        """
+        return self.run_in_at(frames_per_second) + self.reach_at(frames_per_second)
+
     @property
     def voxel_grids(self) -> int:
         """Voxel grids of a sample: T + lead_voxels, times ``grids_per_frame`` if that is set."""
@@ -745,7 +775,8 @@ class Recipe(Persisted):
         brightest = 1.0 if self.light == "sdr" else BRIGHTEST
         ends = math.log(self.log_eps[0]), math.log1p(self.log_eps[1] + (brightest - 1.0))
         unit = step_seconds if self.noise_unit == "second" else 1.0
-        steps = self.spans * int(self.steps_at(self.frame_stride / step_seconds))
+        rate = self.frame_stride / step_seconds
+        steps = self.spans * int(self.steps_at(rate)) + int(self.run_in_at(rate)) // self.frame_stride
         segments = self.most_segments(steps, levels_per_step)
         worst = worst_of({name: getattr(self, name) for name in effect_settings()}, segments, steps * step_seconds)
         return most_events(segments, ends, (low, high), steps * (sigma * math.sqrt(unit) + hot * unit), *worst)

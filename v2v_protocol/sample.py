@@ -345,6 +345,8 @@ class Provenance(Persisted):
             (``substep_px``, ``world_change_share``).
         remark: what of the video is not served, or served with wrong grey levels or times; empty for most.
         dropped: as ``boxes_dropped``, for other labels by name; only those that have any.
+        run_in: frames before the clip that its pixels start from; 0: there were too few, so they start by the
+            triangular law; None: the recipe asks for none (``start``).
     """
 
     id: SampleId
@@ -368,6 +370,7 @@ class Provenance(Persisted):
     substeps: int = later(0)
     remark: str = later("")
     dropped: Mapping[str, int] = later(default_factory=dict)
+    run_in: int | None = later(None)
 
     @property
     def is_recorded(self) -> bool:

@@ -157,7 +157,7 @@ def _all_cut(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal:
 
 
 def _too_large(video: VideoEntry, rows: Rows, spec: StreamSpec) -> Refusal | None:
-    steps = int(spec.recipe.reach_at(video.frames_per_second)) // spec.recipe.frame_stride
+    steps = int(spec.recipe.held_at(video.frames_per_second)) // spec.recipe.frame_stride
     if steps <= most_steps(video, rows, spec):
         return None
     read, taken = (size * (steps + 1) for size in frame_bytes(video, rows, spec))

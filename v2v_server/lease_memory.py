@@ -65,7 +65,7 @@ def lease_bytes(video: VideoEntry, rows: Rows, spec: StreamSpec, array_bytes: in
     """
     recipe = spec.recipe
     window, crop, depth = _sizes_of(video, rows, spec)
-    frames = int(recipe.reach_at(video.frames_per_second)) // recipe.frame_stride + 1
+    frames = int(recipe.held_at(video.frames_per_second)) // recipe.frame_stride + 1
     # Repeated frames are left out of a copy, and a picture is turned upright in one: phones film upright pictures so.
     is_copied = (spec.scene != "off" and "duplicates" not in spec.kept_defects) or video.height_px > video.width_px
     views = (recipe.resize_scale != (1.0, 1.0)) + (2 if recipe.contrast_probability else 1)

@@ -223,7 +223,7 @@ class SequenceTable:
         rates, size = columns.rates[first:end], columns.size[first:end]
         strides = np.maximum(recipe.sequence_at(rates), 1)
         counts = np.clip((columns.frames[first:end] - 1) // strides, 0, spec.max_sequences_per_video)
-        counts *= self._suits[size] & (recipe.reach_at(rates) <= self._most_steps[size] * recipe.frame_stride)
+        counts *= self._suits[size] & (recipe.held_at(rates) <= self._most_steps[size] * recipe.frame_stride)
         if least_hz := self._kind.least_hz(spec):
             counts *= rates >= least_hz * (1.0 - 1e-6)
         if recipe.is_timed:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from v2v_pictures.camera import Camera
 from v2v_protocol.errors import VideoError
-from v2v_protocol.recipe import Recipe, effect_settings
+from v2v_protocol.recipe import FRAMES, Recipe, effect_settings
 from v2v_protocol.sample import SampleParams
 from v2v_protocol.spec import StreamSpec
 from v2v_server.corpus.catalogue import Catalogue
@@ -70,7 +70,7 @@ def quiet_voxels(made: RemadeSample, start: str = "") -> npt.NDArray[Any]:
         hot_pixel_count=0,
         effects={name: value for name, value in plan.params.effects.items() if name not in _NOISE},
     )
-    quiet = Decoded(replace(plan, params=params, flow=None), made.decoded.clip)
+    quiet = replace(made.decoded, plan=replace(plan, params=params, flow=None))
     return make_sample(job, quiet).arrays["voxels"]
 
 
@@ -179,7 +179,9 @@ class WholePictures:
             crop_height_px=height, crop_width_px=width, resize_scale=(1.0, 1.0), flip_probability=0.0,
             pause_probability=0.0, contrast_probability=0.0, threshold=(THRESHOLD, THRESHOLD),
             threshold_ratio=(1.0, 1.0), threshold_source="sample", lead_frames=0, lead_voxels=0,
-            voxel_seconds=recipe.voxel_seconds[1], **dict.fromkeys(effect_settings(), (0.0, 0.0)),
+            voxel_seconds=recipe.voxel_seconds[1],
+            start="triangular" if recipe.start == FRAMES else recipe.start,
+            **dict.fromkeys(effect_settings(), (0.0, 0.0)),
         )  # fmt: skip
         index, stride = catalogue.frame_index(clip.video), recipe.frame_stride
         whole = replace(

@@ -41,6 +41,7 @@ def spec_of_whole(spec: StreamSpec, video: VideoEntry, rows: Rows) -> StreamSpec
         spec.recipe, voxels_per_clip=steps, bins=1, frames_per_bin=1, grids_per_frame=0, voxel_seconds=(0.0, 0.0),
         lead_frames=0, lead_voxels=0, crop_width_px=video.width_px, crop_height_px=bottom - top,
         resize_scale=(1.0, 1.0), flip_probability=0.0, pause_probability=0.0,
+        start="triangular" if spec.recipe.start == "frames" else spec.recipe.start,
     )  # fmt: skip
     return StreamSpec(recipe=recipe, substep_px=spec.substep_px)
 

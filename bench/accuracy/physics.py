@@ -12,8 +12,12 @@ frame. Both sides start with the same residuals and are summed into the same bin
 With a low-pass, the events of a bin are those of its net change. The photograph "coffee" at 30 frames a second shows
 how many of the events with 24 bins a frame fire with fewer bins.
 
+A film also tells what the start of a clip costs: the voxel error of first grids of 5 frames, by start, against pixels
+that have seen 60 frames before. Both sides are means of 16 draws; "floor" is what these leave.
+
 Bars: scenes without a turn are exact at every frame rate; from all frames of the film, V2V and the event-by-event
-simulation of the same frames differ in at most 60 bins of a million.
+simulation of the same frames differ in at most 60 bins of a million; its first grids are nearest with the start of
+frames, then the triangular one.
 """
 
 from __future__ import annotations
@@ -35,6 +39,7 @@ from tests.oracles.noise import start_uniforms
 from tests.oracles.rendered import GAMMA, LOG_EPS, Reals, log_levels
 from v2v_protocol.command import Parser
 from v2v_protocol.errors import UsageError
+from v2v_protocol.recipe import FRAMES, Recipe
 from v2v_server.simulation import simulate, simulate_log
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.video.probe import probe
@@ -50,6 +55,8 @@ RENDERED_HZ, BIN_FRAMES, BINS = 1200, 48, 8
 EVERY = (1, 2, 4, 8, 16, 48)
 SPEEDS_PX = (0.005, 0.02, 0.1, 0.5)  # px per rendered frame: 6 to 600 px/s
 VIDEO_EVERY, VIDEO_BIN_FRAMES, VIDEO_SIDE_PX = (1, 2, 4, 8, 16), 16, 320
+LONG_RUN_IN, FIRST_GRID, MOST_STARTED, START_DRAWS = 60, 5, 600, 16
+STARTED = "uniform", "triangular", FRAMES, "floor"
 LARGEST_DIFFERENCE_PPM = 60.0
 LOW_PASS_HZ, LOW_PASS_PX, PARTS = (30.0, 100.0, 300.0), (2.0, 6.0, 12.0), (1, 2, 3, 6, 24)
 
@@ -163,6 +170,35 @@ def filmed(path: Path) -> Iterator[dict[str, Any]]:
             }  # fmt: skip
 
 
+def started(path: Path) -> Iterator[dict[str, Any]]:
+    """Yield one record for each threshold: the error of first grids by start, on the square that changes most."""
+    facts = probe(path)
+    frames = liveliest(decode_luma(path, facts.index, 0, min(facts.frames, MOST_STARTED)).frames, VIDEO_SIDE_PX)
+    run_in = int(Recipe(start=FRAMES).run_in_at(facts.frames_per_second))
+    ways = (0, "uniform"), (0, "triangular"), (run_in, "triangular"), (LONG_RUN_IN, "triangular")
+    for threshold in THRESHOLDS[1:3]:
+        wrong, events = np.zeros(len(ways)), 0.0
+        for at in range(LONG_RUN_IN, len(frames) - FIRST_GRID, LONG_RUN_IN):
+            true = first_grid(frames, at, *ways[-1], threshold, SEED + START_DRAWS)
+            wrong += [np.abs(first_grid(frames, at, *way, threshold) - true).sum() for way in ways]
+            events += np.abs(true).sum()
+        errors_of = dict(zip(STARTED, (wrong / max(events, 1.0)).tolist(), strict=True))
+        yield {"measure": "start", "video": path.name, "threshold": threshold, "run_in": run_in, **errors_of}
+
+
+def first_grid(frames: Frames, at: int, run_in: int, start: str, threshold: float, seed: int = SEED) -> Reals:
+    """Return V2V's signed counts from frame ``at`` on, after ``run_in`` frames before it, in the mean of the draws of
+    the start: [FIRST_GRID, H, W].
+    """
+    seen = frames[at - run_in : at + FIRST_GRID + 1]
+    made = np.zeros((FIRST_GRID, *frames.shape[1:]))
+    for drawn in range(seed, seed + START_DRAWS):
+        made += simulate(
+            seen, threshold_pos=threshold, gamma=GAMMA, log_eps=LOG_EPS, bins=1, seed=drawn, dtype="int16", start=start
+        ).voxels[run_in:, 0]
+    return made / START_DRAWS
+
+
 def liveliest(frames: Frames, side: int) -> Frames:
     """Return the square of that side whose grey levels change most."""
     if min(frames.shape[1:]) < side:
@@ -183,6 +219,8 @@ def missed(records: Sequence[Record]) -> list[str]:
             texts += beyond(f"{r['scene']} at {r['frame_rate_hz']} Hz", r, least=none, most=none)
         if r["measure"] == "film" and r["every"] == 1:
             texts += beyond(f"film at c = {r['threshold']:g}", r, most={"differing_bins_ppm": LARGEST_DIFFERENCE_PPM})
+        if r["measure"] == "start" and not r[FRAMES] < r["triangular"] < r["uniform"]:
+            texts.append(f"first grids of {r['video']} at c = {r['threshold']:g} are not in order")
     return texts
 
 
@@ -208,7 +246,7 @@ def measure(asked: argparse.Namespace) -> Report:
     """Run the bench."""
     cv2.setNumThreads(1)
     scenes, photographs = list(analytic()), moved_photographs()
-    film = [] if asked.video is None else list(filmed(asked.video))
+    film, starts = ([], []) if asked.video is None else (list(filmed(asked.video)), list(started(asked.video)))
     title = "photographs against light: px a frame"
     tables = [
         pivot(scenes, {"scene": "count / voxel error at c = 0.2", "events_true": "events"}, "frame_rate_hz", "Hz"),
@@ -221,7 +259,10 @@ def measure(asked: argparse.Namespace) -> Report:
     tables.append((low_pass, columns))
     if film:
         tables.append(pivot(film, {"every": "film, every n-th frame", "frame_rate_hz": "Hz"}, "threshold", "c ="))
-    records = [*scenes, *photographs, *low_pass, *film]
+        tables.append((starts, [("video", "first grids of", "{}", 1), ("threshold", "c", "{:g}", 1), *(
+            (law, law, "{:.2f}", 1) for law in STARTED
+        )]))  # fmt: skip
+    records = [*scenes, *photographs, *low_pass, *film, *starts]
     return Report(records, tables, missed=missed(records))
 
 

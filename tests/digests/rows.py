@@ -86,6 +86,7 @@ PORTABLE: Mapping[str, Row] = {
     "davis346": Row("davis346", (*_EVENTS, "frames")),
     "davis346-running": Row("davis346-running", (*_EVENTS, "frames")),
     "davis346-measured": Row("davis346-measured", (*_EVENTS, "frames")),
+    "davis346-band": Row("davis346-band", (*_EVENTS, "frames"), count=6),
     "natural-davis346": Row(spec={"preset": "natural-davis346"}, count=9),
     "balanced": Row(spec={"preset": "balanced", "sibling_spacing": 2}),
     "natural": Row(spec={"preset": "natural"}, count=9),
@@ -103,6 +104,15 @@ PORTABLE: Mapping[str, Row] = {
     "start": Row(FINE | {"start": "triangular"}),
     "start of effects": Row(
         {"preset": "davis346", "start": "triangular", "rate_draw": "log", "shot_noise_hz": (0.1, 5.0)}, _EVENTS
+    ),
+    "start of frames": Row(
+        FINE | {"start": "frames", "frame_stride": 2},
+        ("voxels", "frames", "frames_rgb"),
+        AUTO | {"substep_px": 0.5},
+        count=6,
+    ),
+    "start of frames of photographs": Row(
+        {"preset": "worlds", "start": "frames"}, ("voxels", "frames", *_TRUTH), kind="photographs"
     ),
     "start at zero": Row(FINE | {"start": "zero"}),
     "event_counts": Row(FINE, ("event_counts",)),
@@ -212,6 +222,7 @@ def digest(array: npt.NDArray[Any]) -> str:
 def _drawn(sample: Sample) -> dict[str, Any]:
     provenance = sample.provenance
     drawn = {name: getattr(provenance, name) for name in _DRAWN}
+    drawn |= {} if provenance.run_in is None else {"run_in": provenance.run_in}
     drawn |= {"saturated": dict(provenance.saturated), "grid_seconds": list(provenance.grid_seconds)}
     drawn |= {"labelled": sorted(set(sample.arrays) & {"boxes", "masks"} - set(provenance.unlabelled))}
     plain: dict[str, Any] = json.loads(json.dumps(drawn | provenance.params.to_dict()))

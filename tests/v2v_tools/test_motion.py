@@ -157,7 +157,7 @@ def test_the_share_of_noise_is_measured(corpus: Catalogue, tmp_path: Path, monke
 
 def test_the_start_makes_the_events_of_a_still_clip_and_none_if_it_is_zero(tmp_path: Path) -> None:
     """Where levels waver by one, only residuals near a threshold cross it: those that a start puts there."""
-    frames = np.full((12, 64, 64), 60, np.uint8)
+    frames = np.full((22, 64, 64), 60, np.uint8)
     frames[1::2] = 61
     write_clip(tmp_path / "still.mkv", frames, codec="ffv1", pixel_format="gray")
     catalogue = open_catalogue(tmp_path, rows=Rows.parse("full"), cache_dir=tmp_path / "cache")
@@ -166,6 +166,11 @@ def test_the_start_makes_the_events_of_a_still_clip_and_none_if_it_is_zero(tmp_p
     for start in ("uniform", "triangular", "zero"):
         spec = StreamSpec.from_dict({"recipe": {**size, "start": start}})
         shares[start] = start_events(Remaker(catalogue, spec).made(0, 0, 0))
+    warm = Remaker(catalogue, StreamSpec.from_dict({"recipe": {**size, "start": "frames"}}))
+    samples = [warm.made(0, 0, index) for index in range(warm.count)]
+    for sample in samples:  # frames before the clip wavered too, so these residuals have crossed already
+        assert (start_events(sample)[0] == 0) == (sample.sample.provenance.run_in == 5)
+    assert {sample.sample.provenance.run_in for sample in samples} == {0, 5}
     catalogue.close()
     assert shares["uniform"][0] > 3 * shares["triangular"][0] > 0
     assert all(events[1] == 0 for events in shares.values())

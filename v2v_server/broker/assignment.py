@@ -217,7 +217,7 @@ def work_seconds(spec: StreamSpec, arrays: tuple[str, ...], video: VideoEntry) -
         video: its catalogue entry; pictures are decoded whole.
     """
     recipe, picture_px = spec.recipe, video.width_px * video.height_px
-    frames = int(recipe.reach_at(video.frames_per_second)) + 1
+    frames = int(recipe.held_at(video.frames_per_second)) + 1
     seconds = _DECODE_SECONDS * picture_px * frames
     parts = max(frames, recipe.most_segments(frames // recipe.frame_stride))
     seconds += _SIMULATION_SECONDS * recipe.crop_height_px * recipe.crop_width_px * parts

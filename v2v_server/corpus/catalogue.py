@@ -35,7 +35,7 @@ from v2v_server.corpus.probe import (
     probe_files,
     sidecar_kind,
 )
-from v2v_server.corpus.scenes.scene import Scene
+from v2v_server.corpus.scenes.scene import Scene, frames_before
 from v2v_server.corpus.sources.listing import (
     ListEntry,
     Notice,
@@ -526,15 +526,19 @@ def complete_lease(lease: Lease, catalogue: Catalogue, spec: StreamSpec) -> Leas
         V2VError: the index of this video is damaged, or belongs to another file.
     """
     video, start, recipe, part = lease.video, lease.start_frame, spec.recipe, b""
+    run_in, scene, has_repeats = int(recipe.run_in_at(lease.frames_per_second)), None, "duplicates" in spec.kept_defects
     if spec.scene == "off":
         count = int(recipe.reach_at(lease.frames_per_second)) + 1
         if recipe.is_timed and (number := catalogue.videos.find(video)) is not None:
             count = min(count, int(catalogue.videos.frames[number]) - start)
     else:
         scene, count = catalogue.scene(video), int(recipe.sequence_at(lease.frames_per_second)) + 1
-        if "duplicates" not in spec.kept_defects:
+        if not has_repeats:
             count = int(scene.frames_from(start, count)[-1]) + 1 - start
-        part = scene.slice(start, count).to_bytes()
+    first = min((start, *frames_before(scene, start, run_in, has_repeats=has_repeats).tolist()))
+    if scene is not None:
+        known = 0 if run_in and first == start else first  # its worker sees that the shot has too few
+        part = scene.slice(known, start + count - known).to_bytes()
     sidecars = dict(lease.sidecars)
     for ending in sidecar_endings(lease.arrays):
         mark = lease.sidecars.get(ending, "")
@@ -542,7 +546,7 @@ def complete_lease(lease: Lease, catalogue: Catalogue, spec: StreamSpec) -> Leas
             sidecars[ending] = [mark, problem]
         elif mark and ending.endswith("/"):
             sidecars[ending] = [mark, catalogue.sidecar_files(video, ending, mark, start, count)]
-    frames = catalogue.frame_index_bytes(video, start, count)
+    frames = catalogue.frame_index_bytes(video, first, start + count - first)
     state = catalogue.state(video)
     # A message has no number below 0, such as a time before 1970.
     known = unmarked(catalogue.source, video, state) if state is not None and min(state) >= 0 else ()

@@ -7,21 +7,34 @@ import inspect
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import STARTS, TIME_UNITS, Recipe, effect_settings, most_events, warn_unusual
+from v2v_protocol.recipe import FRAMES, STARTS, TIME_UNITS, Recipe, effect_settings, most_events, warn_unusual
 from v2v_protocol.sample import SampleParams, needs_of
 from v2v_protocol.settings import nearest, plain, require_known
 from v2v_server.simulation.draw import noise_key_of_seed
 from v2v_server.simulation.intensity import Intensity, log_table_float64
-from v2v_server.simulation.kernels import KernelInput, Voxels
+from v2v_server.simulation.kernels import KernelInput, Voxels, following
 from v2v_server.simulation.precision import AUTO, EFFECTS_MARGIN, check_thresholds, choose, noise_sum
 from v2v_server.simulation.voxel import Levels, bin_edges, timed_edges
 from v2v_server.video.picture import SDR, TRANSFERS, Signal
+
+
+class RunIn(NamedTuple):
+    """Frames before a clip, which are simulated and thrown away.
+
+    Attributes:
+        frames: [n + 1, H, W], they and the first of the clip, as those of the clip.
+        step_seconds: [n] duration of each step; None where the clip has none.
+    """
+
+    frames: npt.NDArray[Any]
+    step_seconds: npt.NDArray[np.float64] | None
+
 
 _WEIGHTS = (299, 587, 114)
 """Weights of red, green and blue in grey (ITU-R BT.601), thousandths."""
@@ -158,6 +171,7 @@ def simulate_clip(
     out: Mapping[str, npt.NDArray[Any]] | None = None,
     levels: Levels | None = None,
     signal: Signal = SDR,
+    run_in: RunIn | None = None,
 ) -> Voxels:
     """Simulate one drawn sample.
 
@@ -171,6 +185,8 @@ def simulate_clip(
         out: C-contiguous arrays to fill, by name (``representations.NAMES``); None makes the voxels.
         levels: levels between frames; None: log intensity is linear in time there.
         signal: what the levels mean.
+        run_in: frames that the pixels start from, used if the recipe asks for them; None: they start by the
+            triangular law.
 
     Returns:
         voxels [recipe.voxel_grids, bins, H, W], and the number of saturated bins.
@@ -211,7 +227,21 @@ def simulate_clip(
         step_seconds if recipe.noise_unit == "second" else np.ones(steps), step_seconds, recipe.bins, edges,
         voxel_dtype, levels=levels, grids_have_durations=recipe.is_timed, start=recipe.start,
     )  # fmt: skip
-    return Voxels.of(given, choose(AUTO, _most_events(given, _log_ends(intensity))), out)
+    if run_in is None or recipe.start != FRAMES:
+        return Voxels.of(given, choose(AUTO, _most_events(given, _log_ends(intensity))), out)
+    earlier = len(run_in.frames) - 1
+    lasting = np.ones(earlier) if run_in.step_seconds is None else run_in.step_seconds
+    before = dataclasses.replace(
+        given, frames=run_in.frames, source_index=np.arange(earlier + 1), step_seconds=lasting, bins=1, levels=None,
+        noise_durations=lasting if recipe.noise_unit == "second" else np.ones(earlier),
+        edges=bin_edges(earlier, earlier), grids_have_durations=False,
+    )  # fmt: skip
+    both = dataclasses.replace(
+        given, noise_durations=np.concatenate((before.noise_durations, given.noise_durations)),
+        step_seconds=np.concatenate((lasting, step_seconds)),
+    )  # fmt: skip
+    real = choose(AUTO, _most_events(both, _log_ends(intensity)))
+    return Voxels.of(following(given, before, real), real, out)
 
 
 def _simulate_array(

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from v2v_protocol.events import EventList
-from v2v_server.simulation.effects.kernel import ROWS
-from v2v_server.simulation.kernels import Carried, KernelInput, list_piece
+from v2v_server.simulation.kernels import Carried, KernelInput, list_piece, new_state
 from v2v_server.simulation.precision import Real
 from v2v_server.simulation.voxel import Doubles, Levels, Moments, bin_edges
 
@@ -50,7 +49,7 @@ class ContinuedClip:
         """
         first, steps = 0, len(given.step_seconds)
         while first < steps:
-            carried = self._carried or self._new_state(given)
+            carried = self._carried or Carried(new_state(given, self._real), new_state(given, self._real))
             last = min(first + self._steps_at_once, steps)
             piece = replace(part_of(given, first, last), carried=carried)
             count, events = list_piece(
@@ -67,10 +66,6 @@ class ContinuedClip:
             )
             first = last
             yield events
-
-    def _new_state(self, given: KernelInput) -> Carried:
-        shape = (1 + ROWS if given.params.effects else 1, given.frames[0].size)
-        return Carried(np.empty(shape, self._real), np.empty(shape, self._real))
 
 
 def part_of(given: KernelInput, first: int, last: int) -> KernelInput:

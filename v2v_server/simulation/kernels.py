@@ -6,7 +6,7 @@ import base64
 import math
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -20,7 +20,7 @@ from v2v_protocol.sample import ARRAYS, EventShape, SampleParams, html_table
 from v2v_protocol.spec import VOXEL_DTYPES
 from v2v_server.simulation import effects
 from v2v_server.simulation.effects import noise_band
-from v2v_server.simulation.effects.kernel import FIXED, TRIANGULAR, UNIFORM, Segments, simulate_general
+from v2v_server.simulation.effects.kernel import FIXED, ROWS, TRIANGULAR, UNIFORM, Segments, simulate_general
 from v2v_server.simulation.intensity import Intensity, fine_table, log_table, log_table_float64
 from v2v_server.simulation.pixel import hot_pixels, simulate_pixels
 from v2v_server.simulation.precision import Real
@@ -76,7 +76,7 @@ class KernelInput:
         edges: the ends of the bins.
         dtype: "int8", "int16" or "float32".
         start_residual: log units; None draws it.
-        start: how it is drawn, "uniform" or "triangular"; "zero" starts at 0.
+        start: how it is drawn, "uniform" or "triangular", as "frames" is without ``carried``; "zero" starts at 0.
         levels: intermediate levels, or None.
         grids_have_durations: whether a grid's time is that of ``step_seconds``; else all its steps count as equal.
         carried: what a piece of a longer clip starts from and leaves; None: a clip of its own.
@@ -105,14 +105,14 @@ class KernelInput:
     def law(self) -> tuple[int, float]:
         """How residuals start: a constant of ``effects/kernel.py``, and the value of FIXED."""
         if self.start_residual is None and self.start != "zero":
-            return (TRIANGULAR if self.start == "triangular" else UNIFORM), 0.0
+            return (UNIFORM if self.start == "uniform" else TRIANGULAR), 0.0
         return FIXED, self.start_residual or 0.0
 
     @property
     def needs_general(self) -> bool:
         """Return whether the voxels alone need the general kernel."""
         is_divided = self.grids_have_durations or bool(self.edges.share.any())
-        return bool(self.params.effects) or self.levels is not None or is_divided
+        return bool(self.params.effects) or self.levels is not None or is_divided or self.carried is not None
 
     @property
     def segments(self) -> int:
@@ -165,6 +165,18 @@ def fill(
         return arrays, {"voxels": _paper(given, real, arrays["voxels"])}
     clipped = _General(given, real).run(arrays) if arrays else {}
     return arrays, {name: clipped[name] for name in arrays}
+
+
+def new_state(given: KernelInput, real: Real) -> npt.NDArray[Any]:
+    """Return memory for the state of one side of :class:`Carried`, [1 + ROWS, pixels], or [1, pixels]."""
+    return np.empty((1 + ROWS if given.params.effects else 1, given.frames[0].size), real)
+
+
+def following(given: KernelInput, before: KernelInput, real: Real) -> KernelInput:
+    """Return a clip whose pixels start from what another one, whose last frame is its first, leaves."""
+    left = new_state(given, real)
+    _General(replace(before, carried=Carried(left[:0], left)), real).run({})
+    return replace(given, carried=Carried(left, left[:0], len(before.step_seconds), before.segments, True))
 
 
 def list_events(given: KernelInput, real: Real, step_us: Doubles) -> EventList:

@@ -43,7 +43,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v2v_protocol.errors import UsageError
-from v2v_protocol.recipe import LARGEST_EVENTS, Recipe
+from v2v_protocol.recipe import FRAMES, LARGEST_EVENTS, Recipe
 from v2v_protocol.spec import VOXEL_DTYPES
 from v2v_server.video.picture import MOST_BITS
 
@@ -157,7 +157,8 @@ def variants(
     depths = [8] if recipe.light == "sdr" or levels_per_step else [8, MOST_BITS]
     precisions = ["float32"] if events <= LIMITS["float32"][1] else list(LIMITS)
     has_times = recipe.grids_per_frame > 0 or recipe.is_timed
-    is_general = recipe.has_effects or has_times or levels_per_step > 0 or {"voxels"} != set(arrays)
+    is_plain = not (recipe.has_effects or has_times) and recipe.start != FRAMES
+    is_general = not is_plain or levels_per_step > 0 or {"voxels"} != set(arrays)
     return frozenset(
         Variant(voxel_dtype, is_general, precision, levels_per_step > 0, bits)
         for precision in precisions

@@ -86,11 +86,13 @@ class SampleView(NamedTuple):
     Attributes:
         spec, params: the stream's spec and the sample's draw.
         arrays: requested arrays, by name.
+        before: moments of frames before the clip that are rendered too, seconds since its first one.
     """
 
     spec: StreamSpec
     params: SampleParams
     arrays: tuple[str, ...]
+    before: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -124,15 +124,15 @@ class ClipJob:
         """
         return array_layout(self.spec.recipe, self.spec.voxel_dtype, self.arrays)
 
-    def frame_index(self, count: int) -> FrameIndex:
-        """Decode the index, which has at least ``count`` frames from the start of the sequence on.
+    def frame_index(self, count: int, before: int = 0) -> FrameIndex:
+        """Decode the index, which has at least ``count`` frames from the start of the sequence on, and ``before`` it.
 
         Raises:
             VideoError: the index is damaged; its server may not have checked it.
         """
         try:
             index = FrameIndex.from_bytes(self.index_bytes)
-            index.position(self.start_frame, count)
+            index.position(self.start_frame - before, before + count)
         except (ProtocolError, UsageError) as error:
             raise VideoError(self.video, None, f"its index from the server is damaged: {error}") from error
         return index

@@ -45,6 +45,7 @@ from v2v_server.corpus.scenes.scene import (
     UNKNOWN,
     Scene,
     Sides,
+    frames_before,
 )
 from v2v_server.flow import AUTO, SLOW_METHOD, SLOW_PX, STILL_GREY_LEVELS, STILL_METHOD
 from v2v_server.simulation.draw import FrameTimes, resized_size
@@ -69,31 +70,40 @@ class CleanFrames:
         numbers: int64 [n], their ordinals in the video; more than a sample of ``voxel_seconds`` may use.
         stride: distance of these frames, if it is the same for all; 0 where repeated frames are left out.
         sides: bars outside of the usable picture.
+        before: int64 [n], those before them that the pixels start from; empty if there are too few in the shot.
     """
 
     numbers: npt.NDArray[np.int64]
     stride: int
     sides: Sides
+    before: npt.NDArray[np.int64]
 
     @classmethod
-    def of(cls, scene: Scene | None, start_frame: int, spec: StreamSpec, count: int) -> CleanFrames:
+    def of(cls, scene: Scene | None, start_frame: int, spec: StreamSpec, count: int, run_in: int = 0) -> CleanFrames:
         """Return the frames of the sequence that begins at ``start_frame``.
 
         Args:
             scene: statistics of what the sequence shows; None with scene "off".
             count: frames of the sequence, those that the stride leaves out included.
+            run_in: frames before it that are wanted, those included too.
         """
         stride, kept = spec.recipe.frame_stride, spec.kept_defects
         numbers = start_frame + np.arange(count, dtype=np.int64)
         if scene is not None and "duplicates" not in kept:
             numbers = scene.frames_from(start_frame, count)
-        is_even = int(numbers[-1]) - start_frame < count
+        before = frames_before(scene, start_frame, run_in, has_repeats="duplicates" in kept)
+        is_even = int(numbers[-1]) - min((start_frame, *before[:1].tolist())) < count + len(before)
         sides = NO_BARS if scene is None or "bars" in kept else scene.sides(start_frame, int(numbers[-1]) + 1)
-        return cls(numbers[::stride], stride if is_even else 0, sides)
+        return cls(numbers[::stride], stride if is_even else 0, sides, before[::stride])
+
+    @property
+    def first(self) -> int:
+        """Return the first frame of all that are decoded."""
+        return int((self.before if len(self.before) else self.numbers)[0])
 
     @property
     def span(self) -> int:
-        """Return the number of the video's frames from the first to the last of these."""
+        """Return the number of the video's frames from the first to the last of the sequence."""
         return int(self.numbers[-1] - self.numbers[0]) + 1
 
     @property
@@ -108,14 +118,18 @@ class CleanFrames:
         return "; ".join(filter(None, parts))
 
     def count(self, frames: int) -> int:
-        """Return how many frames are to be decoded for the first of these, ``frames`` in number."""
-        return frames if self.stride else int(self.numbers[frames - 1] - self.numbers[0]) + 1
+        """Return how many frames are to be decoded for the first of these, ``frames`` in number, and those before."""
+        return int(self.places(np.array([frames - 1]))[0]) + 1
+
+    def places(self, numbers: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """Return which decoded frame each of some frames of the sequence is, [n] both."""
+        return numbers + len(self.before) if self.stride else self.numbers[numbers] - self.first
 
     def pick(self, clip: DecodedClip, frames: int) -> DecodedClip:
-        """Return the first of these, ``frames`` in number, from a clip of :meth:`count` frames."""
+        """Return those before and the first of these, ``frames`` in number, from a clip of :meth:`count` frames."""
         if self.stride:
             return clip
-        at = self.numbers[:frames] - self.numbers[0]
+        at = np.concatenate((self.before, self.numbers[:frames])) - self.first
         motion = None if clip.motion is None else _motion_between(clip.motion, at)
         return replace(clip, frames=clip.frames[at], seconds=clip.seconds[at], motion=motion)
 

@@ -50,9 +50,11 @@ def render_clip(
 ) -> DecodedClip:
     """Render what the camera of a sample sees, and the requested arrays that are known.
 
+    Before the clip, nothing shakes or changes its pace.
+
     Args:
         pyramid, picture_px: the usable part of the photograph; its height and width.
-        times: [n] presentation times of the frames.
+        times: [n] presentation times of the frames of the clip.
         sample: (seed, epoch, index).
         view: of the sample.
         codec: the format of the photograph's file.
@@ -79,7 +81,8 @@ def render_clip(
     levels = levels_between(pyramid, world, seconds, source, parts)
     if levels is not None and shown is not None:
         levels = levels._replace(grey=np.stack([shown[level] for level in levels.grey]))
-    frames = apply_view(render(pyramid, world, seconds), seen, recipe, signal)
+    before = np.array(view.before)
+    frames = apply_view(render(pyramid, world, np.concatenate((before, seconds))), seen, recipe, signal)
     known = tuple(name for name in TRUTH if name in view.arrays)
     arrays = _truth(world, seconds[source[ends]], spec, known) if known else {}
     if BLURRED in view.arrays:
@@ -89,8 +92,9 @@ def render_clip(
         total = _exposed(pyramid, world, seconds, source, middles, params.exposure_seconds, light)
         arrays[BLURRED] = tones_of(total[:, None, :, :: -1 if world.flip else 1], recipe.gamma)
     return DecodedClip(
-        frames, times, codec, codec in BIT_EXACT_CODECS, signal=signal, arrays=arrays, is_view=True, levels=levels
-    )
+        frames, np.concatenate((times[0] + before, times)), codec, codec in BIT_EXACT_CODECS, signal=signal,
+        arrays=arrays, is_view=True, levels=levels,
+    )  # fmt: skip
 
 
 def _exposed(

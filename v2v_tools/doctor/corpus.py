@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from v2v_protocol.errors import CorpusError, V2VError
 from v2v_protocol.programs import counted
-from v2v_protocol.recipe import Recipe
+from v2v_protocol.recipe import FRAMES, Recipe
 from v2v_protocol.sample import DEFAULT_ARRAYS, array_layout, layout_bytes
 from v2v_protocol.spec import StreamSpec
 from v2v_protocol.spec_flags import recipe_setting
@@ -117,7 +117,7 @@ def _lines(catalogue: Catalogue, spec: StreamSpec, recipe: str) -> Iterator[Line
     yield "ok", "corpus", text, ""
     yield (
         "ok", "start", f"{describe_start(np.asarray(starts))}; {counted(min(4, remaker.count), 'sample')}",
-        "" if spec.recipe.start == "triangular" else "start: triangular begins as a running camera does",
+        "" if spec.recipe.start in ("triangular", FRAMES) else "start: triangular begins as a running camera does",
     )  # fmt: skip
 
 

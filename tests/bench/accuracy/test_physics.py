@@ -134,3 +134,15 @@ def test_a_film_that_is_too_short_or_small_is_refused(tmp_path: Path) -> None:
     small = write_clip(tmp_path / "small.mp4", panned_luma(20))
     with pytest.raises(UsageError, match="64x48 pixels; give at least 320x320"):
         list(physics.filmed(small))
+
+
+def test_first_grids_are_nearest_after_frames_then_with_the_triangular_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(physics, "VIDEO_SIDE_PX", 48)
+    luma = np.rint(255.0 * moved_photograph("coffee", 2 * physics.LONG_RUN_IN, 48, 48, 0.25)).astype(np.uint8)
+    records = list(physics.started(write_clip(tmp_path / "a.mkv", luma, codec="ffv1", pixel_format="gray")))
+    assert [(each["threshold"], each["run_in"]) for each in records] == [(0.2, 5), (0.5, 5)]
+    assert physics.missed(records) == []
+    swapped = [each | {"frames": each["triangular"], "triangular": each["frames"]} for each in records]
+    assert len(physics.missed(swapped)) == 2

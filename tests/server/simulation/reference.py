@@ -25,6 +25,7 @@ def simulate(
     hot_scale: npt.NDArray[Any],
     frames_per_bin: int,
     dtype: str,
+    residual: npt.NDArray[Any] | None = None,
 ) -> tuple[npt.NDArray[Any], int]:
     """Voxels [steps / frames_per_bin, pixels] and saturated bins.
 
@@ -33,12 +34,14 @@ def simulate(
         key: the noise key.
         noise_scale: [steps], or None for no noise.
         hot_count, hot_sigma, hot_scale: hot pixels, their deviation, and [steps] durations.
+        residual: [pixels] at the start; None draws it uniformly.
     """
     real = level.dtype.type
     steps, pixels = len(level) - 1, level.shape[1]
     positive, negative = real(threshold_pos), real(threshold_neg)
     tolerance = real(rounding_tolerance(threshold_pos, threshold_neg))
-    residual = start_uniforms(key, pixels).astype(real) * (positive + negative) - negative
+    if residual is None:
+        residual = start_uniforms(key, pixels).astype(real) * (positive + negative) - negative
     normals = None if noise_scale is None else standard_normals(key, steps, pixels)
     position, normal = hot_pixels(key, hot_count, pixels)
     drift = normal.astype(real) * real(hot_sigma)

@@ -118,6 +118,20 @@ def clip_pieces(pieces: Pieces, first: int, start: int, end: int) -> Pieces:
     return part
 
 
+def frames_before(scene: Scene | None, start: int, count: int, *, has_repeats: bool) -> npt.NDArray[np.int64]:
+    """Return the ordinals of the last frames before frame ``start``, ascending, [count]; none if its shot has fewer.
+
+    Args:
+        scene: of the video, or a slice that begins with the first of them, or with the video; None: without shots.
+        has_repeats: whether frames that repeat the one before them count.
+    """
+    shots = () if scene is None else scene.shot_boundaries
+    repeats = np.empty(0, np.int64) if scene is None or has_repeats else scene.repeats[scene.repeats < start]
+    first = max((0, start - count - len(repeats), *(shot for shot in shots if shot <= start)))
+    found = np.setdiff1d(np.arange(first, start), repeats, assume_unique=True)
+    return found[len(found) - count :] if len(found) >= count else found[:0]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
     """The statistics of a video, or of a slice of it.
@@ -184,13 +198,17 @@ class Scene:
 
     def frames_from(self, start: int, count: int) -> npt.NDArray[np.int64]:
         """Return the ordinals of frames from ``start`` on, [count], without those that repeat the one before."""
-        repeats = np.repeat(self.pieces["flags"] & Flag.REPEAT, self.pieces["end"] - firsts_of(self.pieces, self.first))
-        dropped = self.first + np.flatnonzero(repeats)
-        dropped = dropped[dropped >= start]
+        dropped = self.repeats[self.repeats >= start]
         # A dropped frame moves each later one by one; the n-th of them has n frames before it that are dropped.
         before = dropped - np.arange(len(dropped)) - start
         wanted = np.arange(count, dtype=np.int64)
         return start + wanted + before.searchsorted(wanted, side="right")
+
+    @property
+    def repeats(self) -> npt.NDArray[np.int64]:
+        """Return the ordinals of the frames that repeat the one before, [n], ascending."""
+        repeats = np.repeat(self.pieces["flags"] & Flag.REPEAT, self.pieces["end"] - firsts_of(self.pieces, self.first))
+        return self.first + np.flatnonzero(repeats)
 
     def sides(self, start: int, end: int) -> Sides:
         """Return the widest bar at each side of frames start .. end - 1."""

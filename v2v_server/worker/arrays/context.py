@@ -15,6 +15,7 @@ from v2v_protocol.recipe import Recipe
 from v2v_protocol.sample import ARRAYS, SampleParams, sidecar_endings
 from v2v_protocol.spec import StreamSpec
 from v2v_server.flow import FlowClip
+from v2v_server.simulation.clip import RunIn
 from v2v_server.simulation.kernels import Voxels
 from v2v_server.simulation.view import FrameArray, Window
 from v2v_server.simulation.voxel import Levels
@@ -62,6 +63,7 @@ class SampleContext:
             array would and the video has no known frame rate.
         flow: flow of the clip; None if it was not requested.
         levels: grey levels between frames (``StreamSpec.levels_per_step``); None if there are none.
+        run_in: frames that the pixels start from; None if there are none, or no array needs events.
         simulated: result of the simulation; None if no array needs events.
     """
 
@@ -75,6 +77,7 @@ class SampleContext:
     step_seconds: npt.NDArray[np.float64] | None
     flow: FlowClip | None
     levels: Levels | None
+    run_in: RunIn | None = None
     simulated: Voxels | None = None
 
     def can_time(self, name: str) -> bool:

@@ -15,16 +15,17 @@ import numpy.typing as npt
 from v2v_protocol import NUMERICS_VERSION
 from v2v_protocol.errors import SidecarError, UsageError, V2VError, VideoError
 from v2v_protocol.events import EventList, whole_edges
+from v2v_protocol.recipe import FRAMES
 from v2v_protocol.sample import ARRAYS, Needs, Provenance, Sample, SampleId, needs_of, new_arrays, sidecar_endings
 from v2v_protocol.spec import MARGIN_PX
 from v2v_server.flow import flow_for
 from v2v_server.kinds.registry import kind_of
 from v2v_server.motion import levels_of
-from v2v_server.simulation.clip import simulate_clip
+from v2v_server.simulation.clip import RunIn, simulate_clip
 from v2v_server.simulation.intensity import eight_bits
 from v2v_server.simulation.kernels import Voxels, list_events
 from v2v_server.simulation.representations import NAMES
-from v2v_server.simulation.view import apply_view, without_margin
+from v2v_server.simulation.view import FrameArray, apply_view, without_margin
 from v2v_server.simulation.voxel import step_seconds
 from v2v_server.video.decode import DecodedClip
 from v2v_server.video.picture import SDR
@@ -111,6 +112,7 @@ def make_sample(
             grid_seconds=_grid_seconds(context),
             substeps=0 if made is None else context.substeps,
             remark=stamp.remark,
+            run_in=plan.run_in if clip.spec.recipe.start == FRAMES else None,
         ),
     )
 
@@ -132,7 +134,7 @@ def span_ends_us(clip: ClipJob, decoded: Decoded) -> npt.NDArray[np.int64]:
     Raises:
         VideoError: the video's frame rate is unknown.
     """
-    seconds, _ = _step_seconds(clip, decoded)
+    seconds, _ = _step_seconds(clip, decoded.clip.seconds, decoded.plan.source)
     times_us = whole_edges(1e6 * np.concatenate([[0.0], np.cumsum(seconds)]))
     return times_us[decoded.plan.params.ends(clip.spec.recipe)]
 
@@ -162,10 +164,13 @@ def sample_context(
         levels = levels_of(part, params, recipe, plan.source, spec.substep_px, read.motion, picture)
     # An array must not make a video unusable for the others: without a rate, it is left empty.
     is_timed = recipe.needs_seconds or needs.seconds == "must" or (bool(clip.frames_per_second and needs.seconds))
-    seconds, irregular = _step_seconds(clip, decoded) if is_timed else (None, 0)
-    view = frames
-    if not read.is_view:
-        view = apply_view(without_margin(frames, params, recipe, plan.margin_px), params, recipe, signal)
+    seconds, irregular = _step_seconds(clip, read.seconds, plan.source) if is_timed else (None, 0)
+    view, run_in = _seen(clip, decoded, frames), None
+    if decoded.before is not None and needs.events:
+        earlier = (
+            None if seconds is None else _step_seconds(clip, decoded.before.seconds, np.arange(plan.run_in + 1))[0]
+        )
+        run_in = RunIn(_seen(clip, decoded, decoded.before.frames), earlier)
     origin = SourceClip(
         clip.start_frame,
         read.seconds,
@@ -176,7 +181,18 @@ def sample_context(
         picture_px=(clip.height_px, clip.width_px),
         usable=usable_window(clip, plan.frames.sides),
     )
-    return SampleContext(clip.video, origin, spec, params, plan.source, view, signal, seconds, flow, levels), irregular
+    return SampleContext(
+        clip.video, origin, spec, params, plan.source, view, signal, seconds, flow, levels, run_in
+    ), irregular
+
+
+def _seen(clip: ClipJob, decoded: Decoded, frames: FrameArray) -> FrameArray:
+    """Return decoded frames, [n, h, w], as the camera sees them, [n, H, W]."""
+    plan, recipe = decoded.plan, clip.spec.recipe
+    if decoded.clip.is_view:
+        return frames
+    part = without_margin(frames, plan.params, recipe, plan.margin_px)
+    return apply_view(part, plan.params, recipe, decoded.clip.signal)
 
 
 def simulate(context: SampleContext, out: Mapping[str, npt.NDArray[Any]]) -> Voxels:
@@ -200,6 +216,7 @@ def simulate(context: SampleContext, out: Mapping[str, npt.NDArray[Any]]) -> Vox
             out,
             context.levels,
             context.signal,
+            context.run_in,
         )
     except UsageError as error:
         # The recipe was checked before, so the values come from the corpus.
@@ -213,13 +230,15 @@ def _grid_seconds(context: SampleContext) -> tuple[float, ...]:
     return tuple(np.add.reduceat(context.step_seconds, context.params.ends(context.recipe)[:-1]).tolist())
 
 
-def _step_seconds(clip: ClipJob, decoded: Decoded) -> tuple[npt.NDArray[np.float64], int]:
-    """Call :func:`step_seconds` for a clip."""
+def _step_seconds(
+    clip: ClipJob, seconds: npt.NDArray[np.float64], source: npt.NDArray[np.int64]
+) -> tuple[npt.NDArray[np.float64], int]:
+    """Call :func:`step_seconds` for frames of a clip."""
     if not clip.frames_per_second:
         why = "the recipe needs seconds" if clip.spec.recipe.needs_seconds else "events need times"
         raise VideoError(clip.video, None, f"its frame rate is unknown, and {why}")
     rate = clip.frames_per_second / clip.spec.recipe.frame_stride
-    return step_seconds(decoded.clip.seconds, decoded.plan.source, rate)
+    return step_seconds(seconds, source, rate)
 
 
 def _decoder(clip: DecodedClip) -> str:

@@ -44,6 +44,7 @@ class SamplePlan:
         source: [steps + 1] int64, which decoded frame each position of the clip shows.
         frames: the frames of the sequence, and the part of the picture that is used.
         cut: the frames to decode after pauses are removed, cropped as far as possible before the resize.
+        run_in: frames of them before the clip, which the pixels start from.
         margin_px: margin around the crop that the clip has, for flow and sub-steps; None: the whole picture.
         flow: settings of the flow if an array needs it.
         flow_plan: flow methods chosen from the statistics of the scene; None if the spec does not use them.
@@ -56,6 +57,7 @@ class SamplePlan:
     margin_px: int | None
     flow: FlowSettings | None
     flow_plan: FlowPlan | None
+    run_in: int = 0
 
 
 def plan_sample(clip: ClipJob, index: int) -> SamplePlan:
@@ -66,7 +68,10 @@ def plan_sample(clip: ClipJob, index: int) -> SamplePlan:
     """
     spec, scene, seed, epoch = clip.spec, clip.scene, clip.seed, clip.epoch
     recipe = spec.recipe
-    frames = CleanFrames.of(scene, clip.start_frame, spec, most_frames(clip))
+    is_view, run_in = kind_of(clip.video).is_view, int(recipe.run_in_at(clip.frames_per_second))
+    # A rendered scene has a past of its own.
+    frames = CleanFrames.of(scene, clip.start_frame, spec, most_frames(clip), 0 if is_view else run_in)
+    run_in = run_in // recipe.frame_stride if is_view else len(frames.before)
     picture = usable_window(clip, frames.sides)
     params = draw(
         recipe,
@@ -97,7 +102,7 @@ def plan_sample(clip: ClipJob, index: int) -> SamplePlan:
     flow: FlowSettings | None = None
     still_px: int | None = 0
     flow_plan = None if scene is None else plan_flow(scene, frames, params, spec, picture, place)
-    is_view, needs = kind_of(clip.video).is_view, needs_of(clip.arrays)
+    needs = needs_of(clip.arrays)
     if not is_view and needs.flow:
         flow = FlowSettings.of(spec)
         if flow_plan is not None and flow_plan.still:
@@ -109,15 +114,13 @@ def plan_sample(clip: ClipJob, index: int) -> SamplePlan:
     chroma = chroma_cut(clip, params, frames, source) if needs.colour else None
     cells = cells_of(params, recipe, within_rows(clip, frames.sides)) if has_motion else None
     cut = Cut(frames.count(int(source[-1]) + 1), window, chroma, cells, still)
-    return SamplePlan(params, source, frames, cut, margin_px, flow, flow_plan)
+    return SamplePlan(params, source, frames, cut, margin_px, flow, flow_plan, run_in)
 
 
 def chroma_cut(clip: ClipJob, params: SampleParams, frames: CleanFrames, source: npt.NDArray[np.int64]) -> ChromaCut:
     """Return which colour to decode: that of the delivered frames, in the crop. ``source``: [steps + 1]."""
     recipe = clip.spec.recipe
-    delivered = np.unique(source[params.ends(recipe)[recipe.first_frame :]])
-    if not frames.stride:
-        delivered = frames.numbers[delivered] - frames.numbers[0]
+    delivered = frames.places(np.unique(source[params.ends(recipe)[recipe.first_frame :]]))
     top, bottom = clip.rows.bounds(clip.height_px)
     window = source_window(params, recipe, usable_window(clip, frames.sides))
     return ChromaCut(tuple(delivered.tolist()), window, (top, bottom - top))

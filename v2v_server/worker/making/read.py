@@ -22,10 +22,11 @@ from v2v_server.worker.making.plan import SamplePlan, plan_sample
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """The decoded clip of a sample, with its plan."""
+    """The decoded clip of a sample, with its plan, and the frames up to its first one that its pixels start from."""
 
     plan: SamplePlan
     clip: DecodedClip
+    before: DecodedClip | None = None
 
 
 def decode_for(
@@ -46,10 +47,11 @@ def decode_for(
     frames = plans[0].frames
     try:
         request = ClipRequest(
-            clip.frame_index(frames.span), clip.start_frame, tuple(plan.cut for plan in plans), frames.stride or 1,
+            clip.frame_index(frames.span, clip.start_frame - frames.first), frames.first,
+            tuple(plan.cut for plan in plans), frames.stride or 1,
             clip.rows.bounds(clip.height_px), _most_bits(clip.spec),
             tuple((clip.seed, clip.epoch, index) for index in indices),
-            tuple(SampleView(clip.spec, plan.params, clip.arrays) for plan in plans),
+            tuple(SampleView(clip.spec, plan.params, clip.arrays, _moments_before(clip, plan)) for plan in plans),
         )  # fmt: skip
         source.expected = clip.video, clip.state
         with source.open_pixels(clip.video, clip.fingerprint) as pixels:
@@ -63,9 +65,27 @@ def decode_for(
         why = "states different transfer characteristics within a clip: re-encode it with one, or set light to sdr"
         raise VideoError(clip.video, clip.start_frame, why)
     return tuple(
-        Decoded(_with_its_margin(plan, read), frames.pick(read, int(plan.source[-1]) + 1))
+        _divided(_with_its_margin(plan, read), frames.pick(read, int(plan.source[-1]) + 1))
         for plan, read in zip(plans, clips, strict=True)
     )
+
+
+def _divided(plan: SamplePlan, read: DecodedClip) -> Decoded:
+    """Divide what was decoded at the first frame of the clip, which both parts have."""
+    if not plan.run_in:
+        return Decoded(plan, read)
+    frames, seconds, motion = read.frames, read.seconds, read.motion
+    clip = replace(
+        read, frames=frames[plan.run_in :], seconds=seconds[plan.run_in :],
+        motion=None if motion is None else motion[plan.run_in :],
+    )  # fmt: skip
+    return Decoded(plan, clip, replace(read, frames=frames[: plan.run_in + 1], seconds=seconds[: plan.run_in + 1]))
+
+
+def _moments_before(clip: ClipJob, plan: SamplePlan) -> tuple[float, ...]:
+    """Return when the frames before a rendered clip are seen, seconds since its first one."""
+    step_seconds = clip.spec.recipe.frame_stride / (clip.frames_per_second or 1.0)
+    return tuple(step_seconds * step for step in range(-plan.run_in, 0))
 
 
 def _with_its_margin(plan: SamplePlan, clip: DecodedClip) -> SamplePlan:
