@@ -3,7 +3,7 @@
 Pure data: it uses the standard library, numpy and msgpack only. Nothing here opens a socket, a file or a clock.
 """
 
-__version__ = "0.2.0"
+__version__ = "1.0.0"
 
 PROTOCOL_VERSION = 8
 """Version of the messages on the wire. Peers of another version are refused with both numbers."""

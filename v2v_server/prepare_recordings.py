@@ -92,12 +92,9 @@ def convert_recordings(source: Path, destination: Path, processes: int) -> Itera
         MOST_MEMORY_BYTES, (target,),
     ):  # fmt: skip
         if isinstance(result, Died):
-            result = PreparedRecording(job.id, problem=f"cannot be read: the process that read it {_how(result)}")
+            how = result.how if result.overdue_seconds else f"died ({result.how})"
+            result = PreparedRecording(job.id, problem=f"cannot be read: the process that read it {how}")
         yield result
-
-
-def _how(died: Died) -> str:
-    return died.how if died.overdue_seconds else f"died ({died.how})"
 
 
 def recordings_in(source: Path, destination: Path) -> Iterator[Conversion]:

@@ -447,7 +447,7 @@ class Router:
             if not self._gate.admits(self._side, user):
                 return None  # the next review disconnects it
         if len(frames) > MOST_MESSAGE_FRAMES:
-            self.disconnect(sender)
+            self.guard.disconnect(sender)
             return None
         return sender, frames, user
 
@@ -465,7 +465,7 @@ class Router:
                 self.socket.send(frame, _NOBLOCK_MORE, copy=False)
             self.socket.send(last, _NOBLOCK, copy=False)
         except zmq.ZMQError:
-            self.disconnect(identity)
+            self.guard.disconnect(identity)
             return False
         if counted >= _TRACKED_BYTES:
             self._taken_at.setdefault(identity, time.monotonic())
@@ -489,16 +489,12 @@ class Router:
             stuck, taken_at = min(self._taken_at.items(), key=lambda each: each[1])
             in_all = sum(size for queue in self._in_flight.values() for _, size in queue)
             if in_all > MOST_IN_FLIGHT_BYTES and now - taken_at > _STUCK_SECONDS:
-                self.disconnect(stuck)
+                self.guard.disconnect(stuck)
         changed = {each: sum(size for _, size in self._in_flight[each]) for each in self._changed}
         self._changed.clear()
         for identity in [identity for identity, nbytes in changed.items() if not nbytes]:
             del self._in_flight[identity], self._taken_at[identity]
         return changed
-
-    def disconnect(self, identity: bytes) -> None:
-        """End the connection of a peer."""
-        self.guard.disconnect(identity)
 
     def take_ended(self) -> list[bytes]:
         """Return the peers whose connection ended since the last call; b"" if one never sent a message.
@@ -512,7 +508,7 @@ class Router:
             self._review_at = now + _REVIEW_SECONDS
             for identity, user in self._users.items():
                 if not self._gate.admits(self._side, user):
-                    self.disconnect(identity)
+                    self.guard.disconnect(identity)
         return ended
 
 
@@ -602,7 +598,7 @@ class Sockets:
 
     def cut(self, identity: bytes) -> None:
         """End the connection of a consumer."""
-        self._consumers.disconnect(identity)
+        self._consumers.guard.disconnect(identity)
 
     def close(self) -> None:
         """End all connections; unsent messages are dropped."""

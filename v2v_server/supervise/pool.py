@@ -385,12 +385,10 @@ class Pool:
         if slot.is_leaving:
             self._release(slot)
         else:
-            slot.start_at = self._now + self._delay(end)
+            delay = self._restarts.delay(self._workers, end.loss) if end.retry_seconds is None else end.retry_seconds
+            slot.start_at = self._now + delay
         is_expected = slot.is_given_up or (slot.is_leaving and end.returncode in (0, -signal.SIGTERM))
         return [Death(slot.name.encode(), end.loss)] if end.is_loss and not is_expected else []
-
-    def _delay(self, end: Exit) -> float:
-        return self._restarts.delay(self._workers, end.loss) if end.retry_seconds is None else end.retry_seconds
 
     def _release(self, slot: WorkerSlot) -> None:
         self._slots.remove(slot)
