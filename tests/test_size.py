@@ -13,7 +13,7 @@ from tests.tools.trace import trace
 
 ROOT = Path(__file__).parents[1]
 PARTS = {
-    "service": (21930, ("v2v_protocol", "v2v_server", "v2v_client")),
+    "service": (21920, ("v2v_protocol", "v2v_server", "v2v_client")),
     "workshop": (5520, ("v2v_tools", "v2v_recordings", "v2v_pictures")),
     "trainer": (4400, ("trainer",)),
 }

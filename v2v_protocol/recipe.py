@@ -153,15 +153,6 @@ _RUNNING: Mapping[str, Any] = {
 stays that of the videos; for frames that are linear in intensity, as a DAVIS stores them, set it to 1.
 """
 
-_MEASURED: Mapping[str, Any] = {
-    **_RUNNING,
-    # 0.006 events a second in a DAVIS346, 2.4 in a DAVIS240C without the bursts of its exposure. A pixel of 0.27 of
-    # white has 0.8 of a black one's.
-    "shot_noise_hz": (0.0075, 3.0),
-    "leak_hz": (0.01, 0.2),  # around the surplus of brighter events in the DAVIS346, 0.015, and v2e's 0.1
-}
-"""The same with the noise of still pixels, as measured in two cameras."""
-
 PRESET_FIELDS: Mapping[str, Mapping[str, Any]] = {
     "paper": {},
     # Ablation "-F": one draw of the thresholds per video, the same in every epoch.
@@ -208,15 +199,13 @@ PRESET_FIELDS: Mapping[str, Mapping[str, Any]] = {
         "hot_pixel_sigma": (0.0, 20.0),
     },
     "davis346-running": _RUNNING,
-    "davis346-measured": _MEASURED,
-    # The same with noise before the comparator, and the pixels of a camera that has seen what was before the clip.
-    "davis346-band": {
-        **_MEASURED,
-        "start": "frames",
-        "shot_noise_hz": (0.0, 0.0),
-        "noise_band_share": (0.08, 0.25),  # at most 0.10 in a still DAVIS346, 0.255 fitted to a DAVIS240C
-        "noise_band_hz": (15.0, 60.0),  # 26 fitted to the latter; 13 and 76 are clearly worse
-        "threshold_mismatch_sigma": (0.1, 0.18),  # 0.14 fitted to it
+    # The same with the noise of still pixels, as measured in two cameras.
+    "davis346-measured": {
+        **_RUNNING,
+        # 0.006 events a second in a DAVIS346, 2.4 in a DAVIS240C without the bursts of its exposure. A pixel of 0.27 of
+        # white has 0.8 of a black one's.
+        "shot_noise_hz": (0.0075, 3.0),
+        "leak_hz": (0.01, 0.2),  # around the surplus of brighter events in the DAVIS346, 0.015, and v2e's 0.1
     },
     "worlds": _WORLDS,
     # The same, closer to light (docs/guides/photographs.md).

@@ -86,7 +86,6 @@ PORTABLE: Mapping[str, Row] = {
     "davis346": Row("davis346", (*_EVENTS, "frames")),
     "davis346-running": Row("davis346-running", (*_EVENTS, "frames")),
     "davis346-measured": Row("davis346-measured", (*_EVENTS, "frames")),
-    "davis346-band": Row("davis346-band", (*_EVENTS, "frames"), count=6),
     "natural-davis346": Row(spec={"preset": "natural-davis346"}, count=9),
     "balanced": Row(spec={"preset": "balanced", "sibling_spacing": 2}),
     "natural": Row(spec={"preset": "natural"}, count=9),
@@ -109,6 +108,18 @@ PORTABLE: Mapping[str, Row] = {
         FINE | {"start": "frames", "frame_stride": 2},
         ("voxels", "frames", "frames_rgb"),
         AUTO | {"substep_px": 0.5},
+        count=6,
+    ),
+    "start of frames with alternating noise": Row(
+        {
+            "preset": "davis346-measured",
+            "start": "frames",
+            "shot_noise_hz": 0.0,
+            "noise_band_share": (0.08, 0.25),
+            "noise_band_hz": (15.0, 60.0),
+            "threshold_mismatch_sigma": (0.1, 0.18),
+        },
+        (*_EVENTS, "frames"),
         count=6,
     ),
     "start of frames of photographs": Row(

@@ -108,7 +108,6 @@ PRESET_DIGESTS = {
     "davis346": "c52d5b5342fc135b5676b3a5116ece57",
     "davis346-running": "1de5b42d34b14b580736c38330ca12b3",
     "davis346-measured": "4a6cb6039d26a7215cb2153ab99014ed",
-    "davis346-band": "d682e1b252bf025446fd83d57350f157",
     "worlds": "71b398f70f04d63139ff2eb79b61849d",
     "worlds-fine": "b426778d302c145883f2b6cdfb1f9d22",
     "recordings": "b3dee5cae311f3e3b51e111a51b9bbac",
