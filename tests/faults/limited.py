@@ -2,7 +2,8 @@
 
     python -m tests.faults.limited BYTES MODULE ARGUMENT ...
 
-A write beyond the limit fails as on a full disk, with another reason ("File too large").
+A write beyond the limit fails as on a full disk, with another reason ("File too large"). They write no bytecode: Python
+would keep files that the limit has cut, for all processes after them.
 """
 
 import os
@@ -12,4 +13,5 @@ import sys
 if __name__ == "__main__":
     limit = int(sys.argv[1])
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
     os.execv(sys.executable, [sys.executable, "-m", *sys.argv[2:]])
