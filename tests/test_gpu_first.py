@@ -78,4 +78,4 @@ def test_a_small_run_leaves_all_figures(tmp_path: Path) -> None:
         assert load_config(str(tmp_path / "work" / "runs" / name / "config.yaml"), fastest) == config
     # A recording without pictures is named, and the default ones are scored.
     assert len(re.findall(r"not scored: .*blind\.h5", done.stderr)) == done.stderr.count("not scored: ") == 2
-    assert [scored["sequences"] for (scored,) in summary["scores"].values()] == [22, 22]
+    assert [scored["sequences"] for (scored,) in summary["scores"].values()] == [20, 20]
